@@ -293,7 +293,7 @@ pub struct Security {
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Contacts {
-    /// `networks`: networks whose addresses are dialed whoever stated them, for example `10.0.0.0/8`. At most 64.
+    /// `networks`: networks whose addresses in received identifiers are dialed, for example `10.0.0.0/8`. At most 64.
     pub networks: Vec<Network>,
 }
 

@@ -212,9 +212,8 @@ impl Service {
             };
             location.signature() != Signature::Frames && !framed.iter().any(same)
         });
-        let others = others.map(with_path);
         let mut all = framed.clone();
-        for location in others.collect::<Vec<_>>() {
+        for location in others.map(with_path) {
             if !all.contains(&location) {
                 all.push(location);
             }

@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, ErrorChain, Letter};
 use fipa_mts::{Mts, Sending};
-use fipa_sds::{Directory, Entry, Reach, Role, Source};
-use fipa_transport::{Attempt, Incarnation, TransportError, TransportErrorKind};
+use fipa_sds::{Directory, Entry, Reach, Role};
+use fipa_transport::{Attempt, Incarnation, Location, TransportError, TransportErrorKind};
 use parking_lot::Mutex;
 use tokio::sync::oneshot;
 
@@ -84,12 +84,11 @@ impl Introductions {
         match directory.lookup(id.name()) {
             None => true,
             Some(known) => {
-                let is_contact = known.source == Source::Contact && !known.incarnation.is_known();
                 let is_accepted = || {
                     let known = self.0.lock();
                     matches!(known.get(&Key::of(id)), Some(Introduced::Accepted))
                 };
-                is_contact && !id.is_received() && !is_accepted()
+                known.is_unregistered_contact() && !id.is_received() && !is_accepted()
             }
         }
     }
@@ -326,8 +325,10 @@ fn send(
     }
     for (receiver, why) in refused {
         let addresses = receiver.addresses().iter();
-        let location = addresses.filter_map(|it| it.parse().ok()).next();
-        let attempt = location.map(|location: fipa_transport::Location| Attempt {
+        let location = addresses
+            .filter_map(|it| it.parse::<Location>().ok())
+            .next();
+        let attempt = location.map(|location| Attempt {
             via: location.kind(),
             location,
             error: TransportError::new(TransportErrorKind::Refused, &*why),

@@ -44,6 +44,12 @@ impl Agent {
         owner
     }
 
+    /// Lets the agent know the owner of the bay.
+    fn owned_by(&mut self, owner: &str, dialect: Dialect) {
+        self.locks
+            .owner_known(0, &bay(), &peer(owner), dialect, &mut self.out);
+    }
+
     /// Passes time, with each timeout at its time.
     fn pass(&mut self, span: Millis) {
         let end = self.now + span;
@@ -307,9 +313,7 @@ fn an_agent_that_joins_during_a_request_is_asked() {
     for kind in [Kind::RicartAgrawala, Kind::RicartAgrawalaExtended] {
         for dialect in [LEGACY, OWN] {
             let mut agent = Agent::new("agent2", kind);
-            agent
-                .locks
-                .owner_known(0, &bay(), &peer("agent1"), LEGACY, &mut agent.out);
+            agent.owned_by("agent1", LEGACY);
             agent.lock(None);
             agent.sent();
             agent
@@ -330,9 +334,7 @@ fn an_agent_that_joins_during_a_request_is_asked() {
 #[test]
 fn a_legacy_agent_that_has_not_asked_is_asked_again_with_a_later_clock() {
     let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
-    agent
-        .locks
-        .owner_known(0, &bay(), &peer("agent1"), LEGACY, &mut agent.out);
+    agent.owned_by("agent1", LEGACY);
     agent.locks.join(0, &peer("agent3"), LEGACY, &mut agent.out);
     agent.lock(None);
     agent.receive("agent1", LEGACY, "agent2_0", Act::Agree { clock: 3 });
@@ -356,9 +358,7 @@ fn the_first_request_waits_for_answers_to_greetings() {
     let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
     agent.locks.expect(0, &peer("agent3"));
     agent.locks.expect(0, &peer("agent4"));
-    agent
-        .locks
-        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    agent.owned_by("agent1", OWN);
     agent.lock(None);
     assert_eq!(agent.sent(), []);
     let alive = |conversation| LockMessage {
@@ -382,9 +382,7 @@ fn the_first_request_waits_for_answers_to_greetings() {
     let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
     agent.locks.expect(0, &peer("agent3"));
     agent.locks.expect(0, &peer("agent4"));
-    agent
-        .locks
-        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    agent.owned_by("agent1", OWN);
     agent.lock(None);
     agent.locks.depart(0, &peer("agent4"), &mut agent.out);
     assert_eq!(agent.sent(), []);
@@ -398,9 +396,7 @@ fn the_first_request_waits_for_answers_to_greetings() {
     // The round of `try_lock` begins after the wait.
     let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
     agent.locks.expect(0, &peer("agent4"));
-    agent
-        .locks
-        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    agent.owned_by("agent1", OWN);
     agent.locks.try_lock(0, &bay(), &mut agent.out);
     agent.pass(1_999);
     assert_eq!(agent.events(), []);
@@ -413,9 +409,7 @@ fn the_first_request_waits_for_answers_to_greetings() {
 #[test]
 fn the_token_returns_to_a_legacy_owner_in_the_conversation_in_which_it_came() {
     let mut agent = Agent::new("agent2", Kind::SuzukiKasamiExtended);
-    agent
-        .locks
-        .owner_known(0, &bay(), &peer("agent1"), LEGACY, &mut agent.out);
+    agent.owned_by("agent1", LEGACY);
     let conversation = |agent: &mut Agent| {
         let sent = agent.sent();
         let of = |act: &Act| matches!(act, Act::RequestToken { .. } | Act::Token(_));
@@ -479,9 +473,7 @@ fn a_withdrawn_request_is_answered_and_its_grant_released() {
     for name in ["agent1", "agent3"] {
         agent.locks.join(0, &peer(name), OWN, &mut agent.out);
     }
-    agent
-        .locks
-        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    agent.owned_by("agent1", OWN);
     let claim = agent.lock(Some(300));
     agent.receive("agent3", OWN, "agent3_0", Act::Request { clock: 5 });
     agent.sent();
@@ -522,9 +514,7 @@ fn a_withdrawn_request_is_answered_and_its_grant_released() {
 fn try_lock_withdraws_after_one_round() {
     let mut agent = Agent::new("agent2", Kind::RicartAgrawalaExtended);
     agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
-    agent
-        .locks
-        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    agent.owned_by("agent1", OWN);
     let first = agent.locks.try_lock(0, &bay(), &mut agent.out);
     let second = agent.locks.try_lock(0, &bay(), &mut agent.out);
     let failed = |claim, ahead| Event::Failed {
@@ -573,9 +563,7 @@ fn a_lost_owner_makes_the_resource_unreachable() {
     for proved in [true, false] {
         let mut agent = Agent::new("agent2", Kind::RicartAgrawalaExtended);
         agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
-        agent
-            .locks
-            .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+        agent.owned_by("agent1", OWN);
         let claim = agent.lock(None);
         if proved {
             agent.locks.depart(0, &peer("agent1"), &mut agent.out);
@@ -814,9 +802,7 @@ fn an_agent_that_owns_nothing_refuses_reports() {
 fn a_grant_that_waited_longer_than_its_lease_is_renewed_before_use() {
     let mut agent = Agent::new("agent2", Kind::default());
     agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
-    agent
-        .locks
-        .owner_known(0, &bay(), &peer("agent1"), OWN, &mut agent.out);
+    agent.owned_by("agent1", OWN);
     let claim = agent.lock(None);
     agent.receive("agent1", OWN, "agent2_0", Act::Agree { clock: 1 });
     agent.now = 14_250;

@@ -1,6 +1,6 @@
 //! The rules for addresses in agent identifiers: which of them a gateway dials.
 //!
-//! An identifier is a claim. Whoever writes it could make a gateway connect to any host and port that the
+//! An identifier is a claim. Without rules, its writer could make a gateway connect to any host and port that the
 //! gateway reaches. [`judge`] is the one function that decides; the core asks it about the addresses in
 //! letters, and the gateway about those that its processes ask it to use.
 
@@ -38,17 +38,10 @@ impl Network {
     /// Whether the network has this address. A mapped IPv4 address counts as the IPv4 address.
     #[must_use]
     pub fn contains(&self, ip: IpAddr) -> bool {
-        match (self.address, ip.to_canonical()) {
-            (IpAddr::V4(own), IpAddr::V4(other)) => {
-                let mask = u32::MAX.checked_shl(32 - u32::from(self.bits));
-                (u32::from(own) ^ u32::from(other)) & mask.unwrap_or(0) == 0
-            }
-            (IpAddr::V6(own), IpAddr::V6(other)) => {
-                let mask = u128::MAX.checked_shl(128 - u32::from(self.bits));
-                (u128::from(own) ^ u128::from(other)) & mask.unwrap_or(0) == 0
-            }
-            _ => false,
-        }
+        let address = ip.to_canonical();
+        let there = Self { address, ..*self };
+        // The prefix of one family is no prefix of the other.
+        address.is_ipv4() == self.address.is_ipv4() && there.masked() == *self
     }
 
     /// Returns the network with all bits behind the prefix set to zero.
@@ -245,6 +238,17 @@ impl Endpoint {
             Self::Named(_, port) => *port,
         }
     }
+}
+
+/// Returns the addresses and ports at which a service with these locations listens on the network.
+pub fn listened_at<'a>(locations: impl IntoIterator<Item = &'a Location>) -> Vec<SocketAddr> {
+    let networked = locations.into_iter();
+    let networked = networked.filter(|location| !location.kind().is_host_local());
+    let own = networked.filter_map(|location| match Endpoint::of(location)? {
+        Endpoint::Numeric(at) => Some(at),
+        Endpoint::Named(..) => None,
+    });
+    own.collect()
 }
 
 /// Returns a location with this address and port instead of its host name. `None` if it has no path.

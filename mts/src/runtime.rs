@@ -39,7 +39,7 @@ use crate::core::{
     Action, Core, CoreConfig, LetterReader, Notice, Now, Peer, PeerState, Received, Route,
     RouteState, SendId, Submission, Undecodable,
 };
-use crate::dial::Endpoint;
+use crate::dial::listened_at;
 
 /// Configuration of the runtime, in addition to that of the core.
 #[derive(Clone)]
@@ -675,12 +675,8 @@ impl Shared {
         let all: Arc<[Location]> = all.collect();
         self.located.send_replace(Arc::clone(&all));
         drop(locations);
-        let networked = all.iter().filter(|it| !it.kind().is_host_local());
-        let own = networked.filter_map(|location| match Endpoint::of(location)? {
-            Endpoint::Numeric(at) => Some(at),
-            Endpoint::Named(..) => None,
-        });
-        self.state.lock().core.listens_at(own.collect());
+        let own = listened_at(&*all);
+        self.state.lock().core.listens_at(own);
     }
 
     fn transport(&self, kind: Kind) -> Option<&Arc<dyn Transport>> {

@@ -46,13 +46,16 @@ fn core(forwards: bool, knows: &[(&str, &str)]) -> Core {
     let directory: Arc<dyn Directory> = Arc::new(StaticDirectory::new(known).unwrap());
     let config = CoreConfig {
         forwards,
-        ..CoreConfig::new(
-            "gateway",
-            Incarnation::from_u64(7),
-            vec![Kind::Shm, Kind::Tcp],
-        )
+        ..gateway(&[Kind::Shm, Kind::Tcp])
     };
     Core::new(config, directory.view())
+}
+
+fn gateway(kinds: &[Kind]) -> CoreConfig {
+    CoreConfig {
+        forwards: true,
+        ..CoreConfig::new("gateway", Incarnation::from_u64(7), kinds.to_vec())
+    }
 }
 
 fn now() -> Now {
@@ -246,15 +249,8 @@ fn a_refused_sender_gets_failure_messages_in_its_dialect_at_a_limited_rate() {
     let at = "shm://9#0000000000000009".parse().unwrap();
     let echo = Registration::new("echo", Incarnation::from_u64(5), vec![at]);
     directory.register(echo).unwrap();
-    let config = CoreConfig {
-        forwards: true,
-        ..CoreConfig::new(
-            "gateway",
-            Incarnation::from_u64(7),
-            vec![Kind::Shm, Kind::Tcp],
-        )
-    };
-    let mut core = Core::new(config, Arc::new(directory)).gated(Arc::new(Refusing("echo")));
+    let mut core = Core::new(gateway(&[Kind::Shm, Kind::Tcp]), Arc::new(directory))
+        .gated(Arc::new(Refusing("echo")));
     let (then, deadline) = (now(), Duration::from_secs(5));
     for _ in 0..200 {
         core.handle_unframed(
@@ -300,13 +296,7 @@ fn heard(core: &mut Core) -> Vec<(String, String)> {
 
 #[test]
 fn the_sender_of_a_recorded_letter_becomes_a_contact_at_its_stated_address() {
-    let host = || {
-        let config = CoreConfig {
-            forwards: true,
-            ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
-        };
-        Core::new(config, host_of("echo").view())
-    };
+    let host = || Core::new(gateway(&[Kind::Shm]), host_of("echo").view());
     let arrives = |core: &mut Core, letter, from| {
         let mut unframed = read(core, letter, Kind::Tcp, from);
         core.handle_unframed(now(), Duration::from_secs(5), &mut unframed);
@@ -352,11 +342,7 @@ fn written_by(core: &mut Core, then: Now, agents: std::ops::Range<u32>) {
 
 #[test]
 fn agents_become_known_by_letters_at_a_limited_rate() {
-    let config = CoreConfig {
-        forwards: true,
-        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
-    };
-    let mut core = Core::new(config, host_of("echo").view());
+    let mut core = Core::new(gateway(&[Kind::Shm]), host_of("echo").view());
     let then = now();
     // The agents of a platform begin together.
     written_by(&mut core, then, 0..900);
@@ -375,11 +361,7 @@ fn agents_become_known_by_letters_at_a_limited_rate() {
 fn an_agent_that_became_known_by_a_letter_keeps_its_name_until_it_is_silent() {
     let contacts = Arc::new(ContactDirectory::new());
     let both = vec![host_of("echo"), Arc::clone(&contacts) as Arc<dyn Directory>];
-    let config = CoreConfig {
-        forwards: true,
-        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
-    };
-    let mut core = Core::new(config, Arc::new(MergedDirectory::new(both)));
+    let mut core = Core::new(gateway(&[Kind::Shm]), Arc::new(MergedDirectory::new(both)));
     let start = Now {
         instant: Instant::now(),
         utc: SystemTime::now(),
@@ -439,15 +421,7 @@ fn without_end(letter: &Letter) -> Letter {
 
 #[test]
 fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_gets_a_failure_message() {
-    let config = CoreConfig {
-        forwards: true,
-        ..CoreConfig::new(
-            "gateway",
-            Incarnation::from_u64(7),
-            vec![Kind::Shm, Kind::Tcp],
-        )
-    };
-    let mut core = Core::new(config, host_of("echo").view());
+    let mut core = Core::new(gateway(&[Kind::Shm, Kind::Tcp]), host_of("echo").view());
     let letter = without_end(&recorded(LETTER));
     let deadline = Duration::from_secs(5);
     let mut unframed = read(&core, letter.clone(), Kind::Tcp, HERE);
@@ -534,15 +508,7 @@ fn recorded_to(receiver: &str) -> Letter {
 #[test]
 fn letters_of_a_legacy_peer_wait_for_a_receiver_that_stands_still() {
     const LETTERS: usize = 5000;
-    let config = CoreConfig {
-        forwards: true,
-        ..CoreConfig::new(
-            "gateway",
-            Incarnation::from_u64(7),
-            vec![Kind::Shm, Kind::Tcp],
-        )
-    };
-    let mut core = Core::new(config, host_of("echo").view());
+    let mut core = Core::new(gateway(&[Kind::Shm, Kind::Tcp]), host_of("echo").view());
     let begun = now();
     let deadline = Duration::from_secs(60);
     let mut under_way = Vec::new();
@@ -581,11 +547,7 @@ fn letters_of_a_legacy_peer_wait_for_a_receiver_that_stands_still() {
 
 #[test]
 fn a_name_with_a_dot_is_reached_as_legacy_peers_write_it() {
-    let config = CoreConfig {
-        forwards: true,
-        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
-    };
-    let mut core = Core::new(config, host_of("arm.left").view());
+    let mut core = Core::new(gateway(&[Kind::Shm]), host_of("arm.left").view());
     let deadline = Duration::from_secs(5);
     core.handle_unframed(
         now(),

@@ -1,5 +1,6 @@
 //! A letter that is too large for one route waits for another that the directory does not show at
-//! present. An error that no repetition changes ends a letter. A letter that is too long without its content is neither sent nor taken.
+//! present. An error that no repetition changes ends a letter. A letter that is too long without its content is neither
+//! sent nor taken.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 

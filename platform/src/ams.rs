@@ -9,14 +9,14 @@ use fipa_acl::{AgentId, Message, Performative};
 use fipa_content::{Content, Dialect, Term, Wff};
 
 use crate::description::{AMS_DESCRIPTION, CONSTRAINTS, Constraints, matches_agent};
-use crate::df::{addresses_for, authorize, result};
+use crate::df::{authorize, result};
 use crate::exception::Exception;
 use crate::kept::{KeptDescription, Text, left, read_object};
 use crate::request::{self, Rejection, Request};
 use crate::search::max_results;
 use crate::{
-    AddressBook, AmsDescription, Answer, ApDescription, Asker, Now, Platform, State, limits,
-    located,
+    AddressBook, AmsDescription, Answer, ApDescription, Asker, Now, Platform, State, addresses_for,
+    limits, located,
 };
 
 /// The agent management system of a platform.

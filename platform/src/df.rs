@@ -17,7 +17,8 @@ use crate::request::{self, Rejection, Request};
 use crate::search::{Comparisons, max_results};
 use crate::subscription::{Subscription, checked_template};
 use crate::{
-    AddressBook, AgentDescription, Answer, Asker, Now, Platform, SubscriptionId, limits, located,
+    AddressBook, AgentDescription, Answer, Asker, Now, Platform, SubscriptionId, addresses_for,
+    limits, located,
 };
 
 /// The directory facilitator of a platform.
@@ -97,9 +98,7 @@ impl Entry {
             description,
         }
     }
-}
 
-impl Entry {
     /// Returns the description for an asker whose platform reaches the agents of this host at these addresses.
     fn located(&self, addresses: &[String]) -> Cow<'_, AgentDescription> {
         let description = Cow::Borrowed(&self.description);
@@ -112,14 +111,6 @@ impl Entry {
             }
             _ => description,
         }
-    }
-}
-
-/// Returns the addresses under which the platform of an asker reaches the agents of this host.
-pub(crate) fn addresses_for(book: Option<&AddressBook>, asker: &Asker) -> Vec<String> {
-    match book {
-        Some(book) if asker.platform != Platform::Host => book(&asker.id),
-        _ => Vec::new(),
     }
 }
 

@@ -193,6 +193,14 @@ pub enum Platform {
 /// empty if it needs none. Answers have them in the identifiers of agents of this host without addresses.
 pub type AddressBook = Arc<dyn Fn(&AgentId) -> Vec<String> + Send + Sync>;
 
+/// Returns the addresses under which the platform of an asker reaches the agents of this host.
+pub(crate) fn addresses_for(book: Option<&AddressBook>, asker: &Asker) -> Vec<String> {
+    match book {
+        Some(book) if asker.platform != Platform::Host => book(&asker.id),
+        _ => Vec::new(),
+    }
+}
+
 /// Returns an identifier with these addresses if it has none.
 pub(crate) fn located(id: AgentId, addresses: &[String]) -> AgentId {
     if !id.addresses().is_empty() {

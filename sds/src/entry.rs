@@ -85,6 +85,13 @@ impl Entry {
         !self.locations.is_empty() && !self.locations.iter().any(supported)
     }
 
+    /// Whether the agent is known by a letter or an introduction only, and has no registration: an agent of a
+    /// platform such as JADE.
+    #[must_use]
+    pub fn is_unregistered_contact(&self) -> bool {
+        self.source == Source::Contact && !self.incarnation.is_known()
+    }
+
     /// Whether the entry is that of an agent of a platform without a gateway of this project, such as
     /// JADE, by the configuration or a letter. It precedes no entry of the gateway that its name may
     /// be [reserved](reserved_for) for, except by the configuration.

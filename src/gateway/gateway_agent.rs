@@ -7,15 +7,14 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::error::Error;
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape, escape_name};
 use fipa_mts::core::{Received, Submission};
-use fipa_mts::dial::{Endpoint, Network};
+use fipa_mts::dial::{Network, listened_at};
 use fipa_mts::{Contacts as _, letter_for};
-use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Matcher, Query, Source};
+use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Matcher, Query};
 use fipa_transport::{Incarnation, Location, log_limit};
 use fipa_transport_net::{Refusals, RefusedDials};
 use parking_lot::Mutex;
@@ -68,17 +67,6 @@ fn is_introduction(message: &Message) -> bool {
         && *message.performative() == Performative::Request
 }
 
-/// Returns the addresses at which the gateway listens on the network.
-fn own_addresses(service: &Service) -> Vec<SocketAddr> {
-    let locations = service.all_locations().into_iter();
-    let networked = locations.filter(|it| !it.kind().is_host_local());
-    let own = networked.filter_map(|location| match Endpoint::of(&location)? {
-        Endpoint::Numeric(at) => Some(at),
-        Endpoint::Named(..) => None,
-    });
-    own.collect()
-}
-
 impl GatewayAgent {
     /// Reads and answers letters until the service ends.
     pub(crate) async fn run(self: Arc<Self>) {
@@ -89,21 +77,21 @@ impl GatewayAgent {
             while introductions.try_join_next().is_some() {}
             match Message::decode(received.letter.payload()) {
                 Ok(message) if is_introduction(&message) => {
-                    let (agent, sender) = (Arc::clone(&self), received.sender);
-                    let is_remote = received.remote;
-                    let has_room = introductions.len() < MAX_INTRODUCTIONS;
+                    let sender = received.sender;
+                    let refusal = if received.remote {
+                        Some("only agents of the gateway's host may introduce others")
+                    } else if introductions.len() >= MAX_INTRODUCTIONS {
+                        Some("the gateway resolves too many host names; try again")
+                    } else {
+                        None
+                    };
+                    if let Some(refusal) = refusal {
+                        self.answer_introduction(&message, sender, Err(refusal.to_owned()));
+                        continue;
+                    }
+                    let agent = Arc::clone(&self);
                     introductions.spawn(async move {
-                        let introduced = match (is_remote, has_room) {
-                            (true, _) => {
-                                Err("only agents of the gateway's host may introduce others"
-                                    .to_owned())
-                            }
-                            (_, false) => {
-                                Err("the gateway resolves too many host names; try again"
-                                    .to_owned())
-                            }
-                            _ => agent.introduce(&message).await,
-                        };
+                        let introduced = agent.introduce(&message).await;
                         agent.answer_introduction(&message, sender, introduced);
                     });
                 }
@@ -193,8 +181,7 @@ impl GatewayAgent {
                 return Ok(());
             }
             let is_there = used.iter().any(|it| known.locations.contains(it));
-            let is_contact = known.source == Source::Contact && !known.incarnation.is_known();
-            if !is_there && !is_contact {
+            if !is_there && !known.is_unregistered_contact() {
                 return Err("the directory lists another agent of this name".to_owned());
             }
         }
@@ -205,7 +192,7 @@ impl GatewayAgent {
                     takers: &self.contacts.takers,
                     contacts: &self.contacts.directory,
                     networks: &self.networks,
-                    own: own_addresses(&self.service),
+                    own: listened_at(&self.service.all_locations()),
                 };
                 let judged = grounds.judge(&used).await;
                 if judged.permitted.is_empty() {

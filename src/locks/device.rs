@@ -48,22 +48,17 @@ impl Device {
     /// # Errors
     /// If a command with this fence must not be acted on.
     pub fn admit(&self, fence: &Fence) -> Result<(), AdmitError> {
-        let (checked, is_new, owner, resource) = {
-            let mut admission = self.admission.lock();
-            let is_new = admission.highest() != Some(fence);
-            let checked = admission.check(fence);
-            let owner = admission.owner().to_owned();
-            (checked, is_new, owner, admission.resource().clone())
-        };
-        let refused = match checked {
-            Ok(()) => {
-                if is_new {
-                    self.shared.saw(&self.core, None, fence, false);
-                }
-                return Ok(());
+        let mut admission = self.admission.lock();
+        let is_new = admission.highest() != Some(fence);
+        let Err(refused) = admission.check(fence) else {
+            drop(admission);
+            if is_new {
+                self.shared.saw(&self.core, None, fence, false);
             }
-            Err(refused) => refused,
+            return Ok(());
         };
+        let (owner, resource) = (admission.owner().to_owned(), admission.resource().clone());
+        drop(admission);
         Err(match refused {
             NotAdmitted::OtherRun { highest } => {
                 let directory = self.core.endpoint.domain.directory();

@@ -176,8 +176,8 @@ impl fmt::Debug for Lock {
     }
 }
 
-/// Returns the owners that the directory lists, with the algorithms that they name, if they differ from those that the agent knows: an owner
-/// that has restarted has another registration.
+/// Returns the owners that the directory lists, with the algorithms that they name, if they differ from those that the
+/// agent knows: an owner that has restarted has another registration.
 fn listed_owners(
     core: &AgentCore,
     shared: &Shared,

@@ -36,8 +36,8 @@
 //!
 //! [`Agent::use_locks`], or the first call of an agent that needs locks, starts them: a task that answers the messages
 //! of other agents. With Ricart-Agrawala, the first request waits until the agents that the directory lists have
-//! answered a greeting, or for [`LockOptions::retry`]. Messages of locks never reach [`Agent::receive`]. An agent that sets 1,024 received messages
-//! aside without reading them receives no renewals, and loses its locks.
+//! answered a greeting, or for [`LockOptions::retry`]. Messages of locks never reach [`Agent::receive`]. An agent that
+//! sets 1,024 received messages aside without reading them receives no renewals, and loses its locks.
 
 mod clock;
 mod device;
@@ -134,7 +134,8 @@ impl Agent {
     /// others. Without this call, the first one that needs locks starts them with the defaults.
     ///
     /// # Errors
-    /// If the agent has been deregistered, if a time is zero or longer than a day, or if the agent has used locks already.
+    /// If the agent has been deregistered, if a time is zero or longer than a day, or if the agent has used locks
+    /// already.
     pub fn use_locks(&self, options: LockOptions) -> Result<(), LockError> {
         shell::set(&self.core, options)
     }

@@ -849,15 +849,12 @@ async fn store(runtime: &Handle, file: &Weak<Mutex<StateFile>>, epoch: u64) -> b
             return false;
         };
         let stored = background::run(runtime, move |_| file.lock().raise(epoch)).await;
-        match stored {
+        let error = match stored {
             Ok(Ok(())) => return true,
-            Ok(Err(error)) => log_limit::error!(
-                %error, "cannot write the state of an owner; it grants nothing meanwhile"
-            ),
-            Err(error) => log_limit::error!(
-                %error, "cannot write the state of an owner; it grants nothing meanwhile"
-            ),
-        }
+            Ok(Err(error)) => error.to_string(),
+            Err(error) => error.to_string(),
+        };
+        log_limit::error!(%error, "cannot write the state of an owner; it grants nothing meanwhile");
         tokio::time::sleep(STORE_AGAIN).await;
     }
 }

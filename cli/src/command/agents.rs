@@ -179,24 +179,20 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let directory = domain.directory();
         directory.refresh();
         let entries = directory.entries();
-        let is_shown = |entry: &Arc<Entry>| filter.matches(entry);
+        let shown = entries.iter().filter(|entry| filter.matches(entry));
+        let shown: Vec<&Arc<Entry>> = shown.collect();
         let is_reported =
             |entry: &&Arc<Entry>| entry.reach != Reach::Local || entry.role == Role::Gateway;
-        let reported = match entries
-            .iter()
-            .filter(|it| is_shown(it))
-            .any(|it| is_reported(&it))
-        {
+        let reported = match shown.iter().any(is_reported) {
             // Without its report the agents are listed as well.
-            true => Reported::asked(&domain, entries.iter().filter(|it| is_shown(it))).await,
+            true => Reported::asked(&domain, &shown).await,
             false => Reported::default(),
         };
         let listed = Listed {
             domain_is_empty: entries.is_empty(),
             gateway: gateway(directory).map(|entry| entry.name.to_string()),
-            entries: entries
+            entries: shown
                 .iter()
-                .filter(|entry| filter.matches(entry))
                 .map(|entry| Row::of(entry, directory, &reported))
                 .collect(),
         };
@@ -242,8 +238,10 @@ struct Reported {
 
 impl Reported {
     /// Asks the gateway of this host. Empty if it does not answer.
-    async fn asked<'e>(domain: &Domain, shown: impl Iterator<Item = &'e Arc<Entry>>) -> Self {
-        let legacy = shown.filter(|entry| is_legacy(entry) && !entry.is_unsupported());
+    async fn asked(domain: &Domain, shown: &[&Arc<Entry>]) -> Self {
+        let legacy = shown
+            .iter()
+            .filter(|entry| is_legacy(entry) && !entry.is_unsupported());
         // No agent has this name, so the report has no routes.
         let mut questions = vec!["fipa-no-agent".to_owned()];
         for name in legacy.map(|entry| literal(&entry.name)) {

@@ -156,7 +156,7 @@ impl<A: Algorithm> Locks<A> {
             return false;
         }
         if let Act::Request { clock } = act {
-            // An agent that does not take part keeps nobody waiting.
+            // No agent waits for one that does not take part.
             let agree = Act::Agree { clock: *clock };
             let to = from.clone();
             self.send_in(kind, to, resource, conversation.clone(), agree, out);

@@ -602,7 +602,7 @@ impl Core {
         }
         let Stated { location, host, .. } = stated;
         if let Some(known) = self.table.view.named(&name) {
-            if known.source != Source::Contact || known.incarnation.is_known() {
+            if !known.is_unregistered_contact() {
                 return false;
             }
             if known.locations.contains(&location) {
