@@ -39,7 +39,9 @@
 
 namespace {
 
+// Maximum length of a message that is received. A sender may exceed it.
 constexpr int most = 10'000'000;
+constexpr int most_sent = 11'000'000;
 
 std::mutex output;
 long budget = -1;
@@ -153,7 +155,7 @@ uint32_t next(std::vector<char>& buffer) {
     }
     const uint32_t length = header[0] | header[1] << 8 | header[2] << 16 |
                             static_cast<uint32_t>(header[3]) << 24;
-    return length <= most && read_exactly(buffer.data(), length) ? length : 0;
+    return length <= buffer.size() && read_exactly(buffer.data(), length) ? length : 0;
 }
 
 void send_one(UDTSOCKET peer, const std::vector<char>& buffer, uint32_t length) {
@@ -232,7 +234,7 @@ int ping(const char* ip, const char* port, long count) {
 
 int send(const char* ip, const char* port) {
     const UDTSOCKET peer = announced(connected(ip, port));
-    std::vector<char> buffer(most);
+    std::vector<char> buffer(most_sent);
     while (const uint32_t length = next(buffer)) {
         send_one(peer, buffer, length);
     }
