@@ -218,6 +218,7 @@ pub struct Locks<A> {
     /// Highest clock of the requests that were answered while there was no state for their resource.
     clock: u64,
     next_conversation: u64,
+    next_side_conversation: u64,
     next_claim: u64,
     /// Messages of this agent to itself. Empty between calls.
     local: VecDeque<LockMessage>,
@@ -317,6 +318,7 @@ impl<A: Algorithm> Locks<A> {
             timers: BTreeSet::new(),
             clock: 0,
             next_conversation: options.first_conversation,
+            next_side_conversation: 0,
             next_claim: 0,
             local: VecDeque::new(),
             touched: BTreeSet::new(),
@@ -750,6 +752,17 @@ impl<A: Algorithm> Locks<A> {
 
     // ----- input
 
+    /// Asks an agent for a sign of life.
+    pub fn probe(&mut self, now: Millis, to: Peer, out: &mut Actions) {
+        let message = LockMessage {
+            conversation: self.side_conversation("probe", now),
+            dialect: Dialect::Own,
+            algorithm: None,
+            content: Content::Probe,
+        };
+        out.push(Action::Send { to, message });
+    }
+
     /// Handles a message. `from` is the sender, as far as its connection proves it.
     pub fn handle(&mut self, now: Millis, from: &Peer, message: &LockMessage, out: &mut Actions) {
         let was_suspected = self
@@ -785,7 +798,7 @@ impl<A: Algorithm> Locks<A> {
         }
         for step in self.probes.handle_timeout(now, &self.options) {
             match step {
-                ProbeStep::Send(peer) => self.probe(peer, now, out),
+                ProbeStep::Send(peer) => self.probe(now, peer, out),
                 ProbeStep::Lost(peer) => self.suspect(now, &peer, out),
             }
         }
@@ -1820,7 +1833,7 @@ impl<A: Algorithm> Locks<A> {
                     let resource = resource.clone();
                     out.push(Action::Event(Event::Raised { resource, epoch }));
                 }
-                OwnerStep::Probe { to, at } => self.probe(to, at, out),
+                OwnerStep::Probe { to, at } => self.probe(at, to, out),
                 OwnerStep::Began(grant) => {
                     let resource = resource.clone();
                     out.push(Action::Event(Event::Granted { resource, grant }));
@@ -1949,10 +1962,12 @@ impl<A: Algorithm> Locks<A> {
         }
     }
 
-    /// A conversation beside those of requests. Its number is the time, so it needs no state.
-    fn side_conversation(&self, kind: &str, now: Millis) -> Conversation {
+    /// A conversation beside those of requests. Its number is the time, or the next one that is free.
+    fn side_conversation(&mut self, kind: &str, now: Millis) -> Conversation {
+        let number = now.max(self.next_side_conversation);
+        self.next_side_conversation = number.saturating_add(1);
         let prefix: Arc<str> = format!("{}_{kind}", self.me.name()).into();
-        Conversation::new(prefix, now)
+        Conversation::new(prefix, number)
     }
 
     #[cfg(test)]
@@ -1973,6 +1988,8 @@ impl<A: Algorithm> Locks<A> {
     #[cfg(test)]
     pub(crate) fn rebase(&mut self, by: Millis) {
         let back = |time: &mut Millis| *time = time.saturating_sub(by);
+        // States that differ in names of conversations alone are equal.
+        self.next_side_conversation = 0;
         self.probes.rebase(by);
         self.greeted.rebase(by);
         for claim in self.claims.values_mut() {

@@ -94,7 +94,7 @@ pub enum OwnerStep {
         /// The act.
         act: Act,
     },
-    /// Store this epoch, and call [`Owner::stored`].
+    /// Store this epoch. The agent confirms it when it is stored.
     Store(u64),
     /// Ask a member for a sign of life.
     Probe {

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Performative, escape, escape_name};
 use fipa_locking::{
-    Action, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Event, Failure, Fence, Kind,
-    LockMessage, Locks, Millis, Peer, Resource, codec,
+    Action, AnyAlgorithm, ClaimId, Dialect, Event, Failure, Fence, Kind, LockMessage, Locks,
+    Millis, Peer, Resource, codec,
 };
 use fipa_mts::letter_for;
 use fipa_sds::{Change, Entry, Reach, Role, Watch};
@@ -829,15 +829,8 @@ impl Task {
 
     /// Asks an agent for a sign of life.
     fn ask(&self, agent: Peer) {
-        let prefix = format!("{}_probe", self.core.endpoint.name);
-        let message = LockMessage {
-            conversation: Conversation::new(prefix.into(), now()),
-            dialect: Dialect::Own,
-            algorithm: None,
-            content: Content::Probe,
-        };
-        self.shared.act(&self.core, |_, _, actions| {
-            actions.push(Action::Send { to: agent, message });
+        self.shared.act(&self.core, |state, now, actions| {
+            state.core.probe(now, agent, actions);
         });
     }
 }

@@ -316,15 +316,4 @@ impl<A: Algorithm> Locks<A> {
             self.at_owner(&resource, out, |core, steps| core.heard(now, peer, steps));
         }
     }
-
-    /// Asks a member for a sign of life.
-    pub(super) fn probe(&mut self, to: Peer, now: Millis, out: &mut Actions) {
-        let message = LockMessage {
-            conversation: self.side_conversation("probe", now),
-            dialect: Dialect::Own,
-            algorithm: None,
-            content: Content::Probe,
-        };
-        out.push(Action::Send { to, message });
-    }
 }

@@ -217,7 +217,6 @@ fn wrong_messages_of_locks_are_violations() {
         "suzuki_kasami_extended",
         &[
             "request ann>ben",
-            "!propagate ann>ben",
             "propagate ben>ann",
             "confirm ann>ben",
             "inform ben>ann",
@@ -226,7 +225,14 @@ fn wrong_messages_of_locks_are_violations() {
             "!request ann>ben",
         ],
     );
-    play("suzuki_kasami_extended", &["!propagate ben>ann"]);
+    // The token came for an earlier request.
+    play(
+        "suzuki_kasami_extended",
+        &["request ann>ben", "propagate ann>ben", "!confirm ann>ben"],
+    );
+    for act in ["!propagate ben>ann", "!propagate ann>ben"] {
+        play("suzuki_kasami_extended", &[act]);
+    }
     play(
         "dlm_probe",
         &[

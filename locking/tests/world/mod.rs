@@ -97,6 +97,17 @@ fn peer(agent: usize, registration: u64) -> Peer {
     Peer::new(&format!("agent{agent}"), registration).unwrap()
 }
 
+/// The log of the seed that is repeated, when it has failed.
+impl Drop for World {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            for line in self.log.iter().flatten() {
+                eprintln!("{line}");
+            }
+        }
+    }
+}
+
 impl World {
     pub(crate) fn new(setup: Setup, seed: u64) -> Self {
         let mut rng = Rng::with_seed(seed);
@@ -570,18 +581,11 @@ impl World {
             .filter(|agent| agent.claim.is_some())
             .map(|agent| format!("{:?}: {:#?}", agent.me, agent.locks))
             .collect();
-        self.print_log();
         Err(format!(
             "open claims at {} ms: {}",
             self.now,
             open.join("\n")
         ))
-    }
-
-    fn print_log(&self) {
-        for line in self.log.iter().flatten() {
-            eprintln!("{line}");
-        }
     }
 
     fn observe(&mut self) -> Result<(), String> {
@@ -620,10 +624,7 @@ impl World {
             }
         }
         match self.histories.iter().find_map(History::violation) {
-            Some(violation) => {
-                self.print_log();
-                Err(format!("at {} ms: {violation}", self.now))
-            }
+            Some(violation) => Err(format!("at {} ms: {violation}", self.now)),
             None => Ok(()),
         }
     }
