@@ -1,4 +1,4 @@
-//! Agent communication for robots after the FIPA standards.
+//! Agent communication for robots, following the FIPA standards.
 //!
 //! # Concepts
 //!
@@ -7,8 +7,9 @@
 //! sockets on one host, and through the gateways (`fipa up`) of the hosts between them.
 //!
 //! A [`Message`] (FIPA00061) has a [`Performative`], such as `request` or `inform`, receivers, and a
-//! content of any bytes. A letter is a message in its envelope. [`Agent::send`] returns one outcome per
-//! receiver, within the deadline: delivered, with the transport; or failed, with the reason.
+//! content of any bytes. A letter is a message in its envelope. [`Agent::send`] returns one [`Outcome`] per
+//! receiver, within the deadline: delivered, with the transport; sent to a legacy peer, which confirms nothing; or
+//! failed, with the reason.
 //!
 //! # Send and receive
 //!

@@ -196,7 +196,7 @@ fn a_link_that_leads_nowhere_is_found() {
     }
     let missing = format!("{REPOSITORY}missing.md");
     assert!(broken(&readme, &missing).is_some());
-    for link in ["#configuration", "docs/glossary.md", "https://example.org"] {
+    for link in ["#promises", "docs/glossary.md", "https://example.org"] {
         assert_eq!(broken(&readme, link), None);
     }
     let (text, blocks) = parts("a [b](c) `[d](e)`\n```rust\n[f](g)\n```\n![h](i \"j\")\n");
