@@ -13,7 +13,7 @@ mod guard;
 mod introductions;
 mod names;
 mod namesakes;
-mod neighbours;
+mod neighbors;
 mod platform_agents;
 mod presence;
 mod publish_pace;
@@ -48,8 +48,8 @@ use self::gateway_agent::GatewayAgent;
 use self::guard::Guard;
 use self::introductions::Takers;
 use self::namesakes::Namesakes;
-pub use self::neighbours::Neighbour;
-use self::neighbours::{Neighbours, View};
+pub use self::neighbors::Neighbor;
+use self::neighbors::{Neighbors, View};
 use self::platform_agents::PlatformAgents;
 #[cfg(feature = "fuzzing")]
 pub(crate) use self::presence::play as play_presence;
@@ -73,7 +73,7 @@ pub struct Gateway {
     owner: Owner,
     network: Option<Arc<dyn Network>>,
     view: Arc<dyn Directory>,
-    neighbours: Arc<Neighbours>,
+    neighbors: Arc<Neighbors>,
     exchange: Arc<Exchanging>,
     state: Arc<StateFile>,
     tasks: Vec<JoinHandle<()>>,
@@ -125,7 +125,7 @@ impl Gateway {
                 refusals: refusals.clone(),
                 refused_dials: refused_dials.clone(),
                 view: &|host, mts| {
-                    contacts.neighbours.name_own(&config.mts.name);
+                    contacts.neighbors.name_own(&config.mts.name);
                     let network = network(config, mts)?;
                     let exchanged = exchange.directory() as Arc<dyn Directory>;
                     let announced = network.clone().map(Network::directory);
@@ -136,7 +136,7 @@ impl Gateway {
                     let remote = Arc::clone(&known) as Arc<dyn Directory>;
                     let view: Arc<dyn Directory> = Arc::new(View {
                         all: MergedDirectory::new(vec![host, remote, contacted]),
-                        neighbours: Arc::clone(&contacts.neighbours),
+                        neighbors: Arc::clone(&contacts.neighbors),
                     });
                     *made.lock() = Some((network, known, Arc::clone(&view)));
                     Ok(view)
@@ -156,7 +156,7 @@ impl Gateway {
             trust,
             Arc::clone(&view),
             Arc::clone(&contacts.directory),
-            Arc::clone(&contacts.neighbours),
+            Arc::clone(&contacts.neighbors),
         ));
         let mut gateway = Self {
             config: config.clone(),
@@ -165,7 +165,7 @@ impl Gateway {
             owner: Owner::this(),
             network,
             view,
-            neighbours: Arc::clone(&contacts.neighbours),
+            neighbors: Arc::clone(&contacts.neighbors),
             exchange,
             state,
             tasks: Vec::new(),
@@ -195,10 +195,7 @@ impl Gateway {
         contacts.network.lock().clone_from(&gateway.network);
         let publish_task = PublishTask::new(publisher, gateway.network.clone());
         gateway.tasks.push(tokio::spawn(publish_task.run()));
-        let follow = follow_locations(
-            Arc::clone(&gateway.service),
-            Arc::clone(&gateway.neighbours),
-        );
+        let follow = follow_locations(Arc::clone(&gateway.service), Arc::clone(&gateway.neighbors));
         gateway.tasks.push(tokio::spawn(follow));
         #[cfg(feature = "secure")]
         let contacted = Arc::clone(&contacts.directory);
@@ -234,7 +231,7 @@ impl Gateway {
         let means = self.means()?;
         let namesakes = Arc::new(Namesakes {
             own: self.service.own.clone(),
-            neighbours: Arc::clone(&self.neighbours),
+            neighbors: Arc::clone(&self.neighbors),
             known: Arc::clone(&known),
             has_keys: means.has_keys,
         });
@@ -242,7 +239,7 @@ impl Gateway {
         let gateway_agent = GatewayAgent {
             service: Arc::clone(&self.service),
             id: means.id.clone(),
-            neighbours: Arc::clone(&self.neighbours),
+            neighbors: Arc::clone(&self.neighbors),
             view: Arc::clone(&self.view),
             exchange: Arc::clone(&self.exchange),
             contacts,
@@ -257,7 +254,7 @@ impl Gateway {
         self.tasks.push(tokio::spawn(Arc::new(gateway_agent).run()));
         let platform_agents = PlatformAgents {
             service: Arc::clone(&self.service),
-            neighbours: Arc::clone(&self.neighbours),
+            neighbors: Arc::clone(&self.neighbors),
             view: Arc::clone(&self.view),
             known: Arc::clone(&known),
             exchange: Arc::clone(&self.exchange),
@@ -272,7 +269,7 @@ impl Gateway {
             .push(tokio::spawn(Arc::clone(&exchange).read_letters()));
         self.tasks.push(tokio::spawn(exchange.run(means, known)));
         let peers = peers(config);
-        self.neighbours.name_peers(peers.clone());
+        self.neighbors.name_peers(peers.clone());
         self.service.mts.keep_in_touch(peers);
         Ok(())
     }
@@ -283,7 +280,7 @@ impl Gateway {
         Ok(Means {
             service: Arc::clone(&self.service),
             id,
-            neighbours: Arc::clone(&self.neighbours),
+            neighbors: Arc::clone(&self.neighbors),
             network: self.network.clone(),
             has_keys: !self.config.security.keys.is_empty(),
         })
@@ -339,8 +336,8 @@ impl Gateway {
     /// Returns the gateways of other hosts with which a connection is open now, whether this
     /// gateway or the other one opened it.
     #[must_use]
-    pub fn neighbours(&self) -> Vec<Neighbour> {
-        self.neighbours.all()
+    pub fn neighbors(&self) -> Vec<Neighbor> {
+        self.neighbors.all()
     }
 
     /// Applies another configuration without losing a letter. The orders of transports, the
@@ -374,7 +371,7 @@ impl Gateway {
         });
         self.service.reorder(config);
         let peers = peers(config);
-        self.neighbours.name_peers(peers.clone());
+        self.neighbors.name_peers(peers.clone());
         self.service.mts.keep_in_touch(peers);
         self.config.mts.deadline = config.mts.deadline;
         self.config.routes.clone_from(&config.routes);
@@ -490,7 +487,7 @@ fn register(service: &Service, cancellation: &Cancellation) -> Result<Arc<Entry>
 /// Updates the gateway's own entry and greets its neighbors when its locations change. The
 /// greetings are needed because the directory of the network does not reach all neighbors.
 /// [`PublishTask`] updates the announcements of the agents.
-async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
+async fn follow_locations(service: Arc<Service>, neighbors: Arc<Neighbors>) {
     let mut locations = service.follow_locations();
     while locations.changed().await.is_ok() {
         let now: Vec<String> = service
@@ -509,7 +506,7 @@ async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
         if let Err(error) = registered.await.unwrap_or_else(|error| Err(error.into())) {
             log_limit::warn!(error = %ErrorChain(&error), "cannot update the gateway in the directory of this host");
         }
-        service.mts.greet(neighbours.to_greet(Instant::now()));
+        service.mts.greet(neighbors.to_greet(Instant::now()));
     }
 }
 
@@ -623,7 +620,7 @@ fn network(_: &Config, _: &fipa_sds::Mts) -> Result<Option<Arc<dyn Network>>, Op
 /// directory listed them.
 #[derive(Default)]
 struct KnownPeers {
-    neighbours: Arc<Neighbours>,
+    neighbors: Arc<Neighbors>,
     directory: Arc<ContactDirectory>,
     publisher: Mutex<Option<Arc<Publisher>>>,
     network: Mutex<Option<Arc<dyn Network>>>,
@@ -671,7 +668,7 @@ impl KnownPeers {
     ) -> Result<(), ContactError> {
         // An agent of a platform without a gateway, such as JADE, must not pass for one of a gateway.
         if let Some(gateway) = reserved_for(name).filter(|_| !agent.is_known())
-            && self.neighbours.has_gateway(gateway)
+            && self.neighbors.has_gateway(gateway)
         {
             return Err(fipa_sds::EntryError::Reserved(gateway.to_owned()).into());
         }
@@ -724,17 +721,17 @@ impl Contacts for KnownPeers {
     }
 
     fn doubtful(&self, location: &Location, fault: TransportErrorKind) {
-        self.neighbours.doubt(location, fault);
+        self.neighbors.doubt(location, fault);
         if let Some(network) = &*self.network.lock() {
             network.doubt(location.incarnation());
         }
     }
 
     fn introduced(&self, peer: &Introduction) {
-        self.neighbours.introduced(peer);
+        self.neighbors.introduced(peer);
     }
 
     fn parted(&self, peer: &Introduction) {
-        self.neighbours.parted(Instant::now(), peer);
+        self.neighbors.parted(Instant::now(), peer);
     }
 }

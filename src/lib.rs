@@ -203,6 +203,6 @@ pub use fipa_transport::{
 #[doc(hidden)]
 pub use fipa_transport::{log_limit, threads};
 #[cfg(feature = "net")]
-pub use gateway::{Gateway, Neighbour};
+pub use gateway::{Gateway, Neighbor};
 pub use incoming::Incoming;
 pub use sender_tasks::SenderTasks;

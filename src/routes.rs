@@ -45,7 +45,7 @@ pub struct Report {
     /// The static peers; empty unless the service is a gateway.
     pub peers: Vec<StaticPeer>,
     /// The gateways with an open connection; empty unless the service is a gateway.
-    pub neighbours: Vec<Connected>,
+    pub neighbors: Vec<Connected>,
     /// The connections that the service has refused because only one side has keys, because a side does not
     /// trust the other, or because the sides have different versions of the protocol, the latest first; empty unless the service is a gateway. Of each address
     /// the latest, of at most 16 addresses.

@@ -246,7 +246,7 @@ impl Service {
             routes: self.mts.routes(to),
             ways: self.mts.ways(),
             peers: self.mts.peers().into_iter().map(Into::into).collect(),
-            neighbours: Vec::new(),
+            neighbors: Vec::new(),
             refused: Vec::new(),
             refused_dials: Vec::new(),
             contested: Vec::new(),

@@ -344,7 +344,7 @@ async fn the_gateway_reports_the_routes_of_letters_and_their_state() {
         .unwrap();
     // The messages between the gateways use the same route, and count as well.
     assert!(counted.taken >= 5 && counted.failed == 0, "{counted:?}");
-    let mut connected = report.neighbours.iter();
+    let mut connected = report.neighbors.iter();
     assert!(connected.any(|it| it.incarnation == far.incarnation()));
 
     // The letters of this process go to the gateway, by the same entry of `[routes]`.

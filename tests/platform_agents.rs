@@ -368,7 +368,7 @@ async fn of_two_agents_with_one_name_that_which_holds_it_is_found() {
     let rover = at_third.register("rover").await.unwrap();
     let df = rover.df().unwrap();
     let service = |found: &[AgentDescription]| found[0].services[0].name.clone().unwrap();
-    until_async("both gateways", || third.neighbours().len() == 2).await;
+    until_async("both gateways", || third.neighbors().len() == 2).await;
     finds(&df, &["crane"]).await;
     let holder = third.directory().known("crane").unwrap().incarnation;
     let (leaving, staying, expected) = match holder == first.incarnation() {

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa::{
-    AgentId, Domain, Gateway, Kind, Letter, Message, Neighbour, Outcome, Performative, contact,
+    AgentId, Domain, Gateway, Kind, Letter, Message, Neighbor, Outcome, Performative, contact,
     routes,
 };
 use fipa_testbed::until_async;
@@ -40,30 +40,30 @@ async fn a_static_peer_is_connected_before_any_letter_and_again_after_its_restar
     // No process listens on the first address.
     let near = config(&[&knowing("far", &["127.0.0.1:9", &at])]);
     let near = Gateway::open(&near).await.unwrap();
-    let far_is = |neighbours: Vec<Neighbour>, incarnation| {
-        let mut all = neighbours.into_iter();
+    let far_is = |neighbors: Vec<Neighbor>, incarnation| {
+        let mut all = neighbors.into_iter();
         all.any(|it| it.entry.incarnation == incarnation && it.peer.as_deref() == Some("far"))
     };
     let first_incarnation = far.incarnation();
     until_async("the far gateway is a neighbor", || {
-        far_is(near.neighbours(), first_incarnation)
+        far_is(near.neighbors(), first_incarnation)
     })
     .await;
     // It accepts gateways that are not in its configuration.
     until_async("the near gateway is a neighbor", || {
-        let mut all = far.neighbours().into_iter();
+        let mut all = far.neighbors().into_iter();
         all.any(|it| it.entry.incarnation == near.incarnation())
     })
     .await;
     far.close().await;
-    until_async("the connection has ended", || near.neighbours().is_empty()).await;
+    until_async("the connection has ended", || near.neighbors().is_empty()).await;
     let mut again = far_config.clone();
     again.transport.tcp.listen = vec![at];
     let far = Gateway::open(&again).await.unwrap();
     let second_incarnation = far.incarnation();
     assert_ne!(first_incarnation, second_incarnation);
     until_async("its next incarnation is a neighbor", || {
-        far_is(near.neighbours(), second_incarnation)
+        far_is(near.neighbors(), second_incarnation)
     })
     .await;
 }

@@ -129,7 +129,7 @@ async fn a_revoked_host_ends_with_its_agents_its_services_and_the_letters_for_it
     );
     assert!(is_unknown, "{outcome:?}");
     assert_eq!(df.search(&lifting).await.unwrap(), []);
-    assert!(near.neighbours().is_empty());
+    assert!(near.neighbors().is_empty());
 }
 
 /// A platform such as JADE has no gateway whose certificate belongs to its agents.

@@ -224,7 +224,7 @@ fn the_certificate_of_each_connection_is_shown() {
     let table = rover.host.run(&["agents", &arm]).done();
     assert!(table.contains(", encrypted"), "{table}");
     let routes = rover.host.run(&["routes", "--json"]).done_json();
-    assert_eq!(routes["gateway"]["neighbours"][0]["security"], link);
+    assert_eq!(routes["gateway"]["neighbors"][0]["security"], link);
     let routes = rover.host.run(&["routes"]).done();
     assert!(
         routes.contains("CONNECTED TO") && routes.contains("encrypted"),

@@ -187,7 +187,7 @@ on_a_network!(
 on_a_network!(
     /// The moving host has no static peers. It reconnects to the gateways of its former
     /// connections.
-    a_dialled_static_peer_moves,
+    a_dialed_static_peer_moves,
     |family| {
         let (network, robots) = two_hosts(family, &["tcp"], &Discovery::FirstDials);
         for number in 51..56 {
@@ -197,7 +197,7 @@ on_a_network!(
     }
 );
 
-on_a_network!(a_dialled_static_peer_moves_by_udp, |family| {
+on_a_network!(a_dialed_static_peer_moves_by_udp, |family| {
     let (network, robots) = two_hosts(family, &["udp"], &Discovery::FirstDials);
     for number in 51..56 {
         network.host(1).move_to(number);

@@ -377,7 +377,7 @@ impl World {
                 let introduction = Introduction {
                     name: format!("mts-{peer}").into(),
                     hop: hop(peer, Kind::Tcp),
-                    dialled: None,
+                    dialed: None,
                     mandate: Mandate::Unproved,
                 };
                 let clocks = world.clocks();
@@ -676,7 +676,7 @@ impl World {
         let introduction = Introduction {
             name: input.one_of(&["mts-3", "mts-1", "liar", "gw"]).into(),
             hop: self.lying_hop(how, input),
-            dialled: None,
+            dialed: None,
             mandate: Mandate::Unproved,
         };
         let now = self.clocks();

@@ -75,8 +75,8 @@ pub fn play(bytes: &[u8]) {
         all.collect()
     };
     let mut present = vec![HONEST, LIARS[0], LIARS[1], LIARS[2]];
-    here.handle_neighbours(now, &gateways(&present));
-    there.handle_neighbours(now, &gateways(&[OWN]));
+    here.handle_neighbors(now, &gateways(&present));
+    there.handle_neighbors(now, &gateways(&[OWN]));
     let mut last: BTreeMap<Incarnation, Vec<u8>> = BTreeMap::new();
     while !input.is_empty() {
         let liar = input.one_of(&LIARS);
@@ -91,7 +91,7 @@ pub fn play(bytes: &[u8]) {
                     Some(at) => drop(present.remove(at)),
                     None => present.push(liar),
                 }
-                here.handle_neighbours(now, &gateways(&present));
+                here.handle_neighbors(now, &gateways(&present));
             }
             6 => {
                 // Another gateway has the location of the neighbor.

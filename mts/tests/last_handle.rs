@@ -89,7 +89,7 @@ fn no_transport_is_closed_from_within_a_call_of_its_own() {
             location: "shm://crex".parse().unwrap(),
             principal: Principal::Unproved,
         },
-        dialled: None,
+        dialed: None,
         mandate: Mandate::Unproved,
     };
 

@@ -241,7 +241,7 @@ fn reports_follow_at_once_when_their_peer_answers_again() {
     let introduction = Introduction {
         name: "peer".into(),
         hop: peer(1),
-        dialled: None,
+        dialed: None,
         mandate: Mandate::Unproved,
     };
     let now = gateway.clocks();

@@ -121,7 +121,7 @@ fn a_peer_that_answers_is_checked_seldom_and_after_its_connection_ends() {
             location: location.clone(),
             principal: Principal::Unproved,
         },
-        dialled: Some(location),
+        dialed: Some(location),
         mandate: Mandate::Unproved,
     };
     bench.core.handle_parted(bench.now, &parted);

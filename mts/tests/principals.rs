@@ -100,7 +100,7 @@ impl Bench {
             let introduction = Introduction {
                 name: name.into(),
                 hop: link(peer, peer),
-                dialled: None,
+                dialed: None,
                 mandate: Mandate::Unproved,
             };
             core.handle_introduced(now, &introduction);
@@ -216,7 +216,7 @@ fn letters_of_a_listed_agent_wait_until_its_gateway_has_introduced_itself() {
     let introduction = Introduction {
         name: "away".into(),
         hop: link(away, away),
-        dialled: None,
+        dialed: None,
         mandate: Mandate::Unproved,
     };
     bench.core.handle_introduced(bench.now, &introduction);
@@ -258,7 +258,7 @@ fn a_service_that_introduces_itself_as_an_agent_of_another_host_takes_nothing_fr
         let introduction = Introduction {
             name: "rover".into(),
             hop: link(agent, LIAR),
-            dialled: None,
+            dialed: None,
             mandate: Mandate::Unproved,
         };
         assert!(bench.core.accepts(&introduction), "as {agent}");
@@ -281,7 +281,7 @@ fn a_connected_service_is_accepted_with_its_own_certificate_only() {
         bench.core.accepts(&Introduction {
             name: "mts".into(),
             hop: link(claimed, principal),
-            dialled: None,
+            dialed: None,
             mandate: Mandate::Unproved,
         })
     };
@@ -352,7 +352,7 @@ fn a_certificate_replaces_a_claim_without_proof() {
             principal,
             ..link(service, HONEST)
         },
-        dialled: None,
+        dialed: None,
         mandate: Mandate::Unproved,
     };
     let claim = introduction("other", Principal::Unproved);
@@ -578,7 +578,7 @@ fn no_other_host_is_a_service_that_this_host_lists() {
     let introduction = Introduction {
         name: "liar".into(),
         hop: link(GATEWAY, LIAR),
-        dialled: None,
+        dialed: None,
         mandate: Mandate::Unproved,
     };
     assert!(!bench.core.accepts(&introduction));
@@ -702,7 +702,7 @@ fn an_introduction_takes_no_steps_for_letters_to_others() {
     let stranger = Introduction {
         name: "stranger".into(),
         hop: stranger(Incarnation::from_u64(500)),
-        dialled: None,
+        dialed: None,
         mandate: Mandate::Unproved,
     };
     let _earlier = fipa_mts::core::work::taken();

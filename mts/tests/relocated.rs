@@ -86,7 +86,7 @@ impl Gateway {
                 location: tcp(1),
                 principal: Principal::Certificate([1; 32]),
             },
-            dialled: None,
+            dialed: None,
             mandate: Mandate::Certified([].into()),
         };
         self.core.handle_introduced(self.now, &introduction);

@@ -249,7 +249,7 @@ impl Service {
         let introduction = Introduction {
             name: format!("peer-{peer}").into(),
             hop: hop(peer),
-            dialled: None,
+            dialed: None,
             mandate: Mandate::Unproved,
         };
         let now = self.clocks();

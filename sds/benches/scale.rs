@@ -110,11 +110,11 @@ impl World {
             other.tell_own(now);
             other
                 .exchange
-                .handle_neighbours(now, std::slice::from_ref(&hub));
+                .handle_neighbors(now, std::slice::from_ref(&hub));
         }
         self.spend(|hub| {
             hub.tell_own(now);
-            hub.exchange.handle_neighbours(now, &present);
+            hub.exchange.handle_neighbors(now, &present);
         });
     }
 

@@ -567,7 +567,7 @@ mod tests {
         let gateway = location().incarnation();
         let mut exchange = Exchange::new(0);
         let mts = Mts::new("arm-mts", gateway);
-        exchange.handle_neighbours(start, &[Present::unproved(mts, vec![location()])]);
+        exchange.handle_neighbors(start, &[Present::unproved(mts, vec![location()])]);
         let known = exchange.directory();
         contacts
             .heard(start, "arm", incarnation(1), location())

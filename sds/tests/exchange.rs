@@ -102,7 +102,7 @@ impl World {
             let now = self.now;
             self.gateways[index]
                 .exchange
-                .handle_neighbours(now, &present);
+                .handle_neighbors(now, &present);
         }
     }
 
@@ -512,7 +512,7 @@ fn a_list_of_which_parts_arrived_and_were_not_read_is_sent_again() {
 
 #[test]
 fn the_kind_of_a_letter_is_read_from_its_beginning() {
-    let (mut exchange, now) = (with_neighbour(), Instant::now());
+    let (mut exchange, now) = (with_neighbor(), Instant::now());
     let mut kinds = Vec::new();
     let mut send = |exchange: &mut Exchange, now| {
         let (to, content) = exchange.poll_letter(now).unwrap();
@@ -553,14 +553,14 @@ fn entries_leave_with_their_gateway() {
     assert!(directory.lookup("arm").is_some());
     // A brief disconnect has no effect.
     let now = world.now;
-    world.gateways[1].exchange.handle_neighbours(now, &[]);
+    world.gateways[1].exchange.handle_neighbors(now, &[]);
     world.run(Exchange::MEMORY / 2);
     assert!(directory.lookup("arm").is_some());
     world.connect();
     world.run(Exchange::MEMORY * 2);
     assert!(directory.lookup("arm").is_some());
     let now = world.now;
-    world.gateways[1].exchange.handle_neighbours(now, &[]);
+    world.gateways[1].exchange.handle_neighbors(now, &[]);
     world.run(Exchange::MEMORY + Duration::from_millis(10));
     assert!(directory.lookup("arm").is_none());
     // It reconnects, without having noticed the disconnect.
@@ -584,7 +584,7 @@ fn agents_of_a_gateway_that_falls_silent_are_lost_for_a_minute() {
     let at = directory.lookup("arm").unwrap().locations.clone();
     let disconnect = |world: &mut World| {
         let now = world.now;
-        world.gateways[1].exchange.handle_neighbours(now, &[]);
+        world.gateways[1].exchange.handle_neighbors(now, &[]);
         assert!(lost("arm").is_none(), "a broken connection may return");
         world.run(Exchange::MEMORY + Duration::from_millis(10));
     };
@@ -610,7 +610,7 @@ fn agents_of_a_gateway_that_falls_silent_are_lost_for_a_minute() {
     // A gateway that says goodbye leaves no lost agents.
     world.say_goodbye();
     let now = world.now;
-    world.gateways[1].exchange.handle_neighbours(now, &[]);
+    world.gateways[1].exchange.handle_neighbors(now, &[]);
     world.run(Exchange::MEMORY * 2);
     assert!(directory.lost_agents().is_empty());
 }
@@ -698,11 +698,11 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let now = world.now;
     let exchange = &mut world.gateways[1].exchange;
     // A connection with the old one appears open: its entries stay.
-    exchange.handle_neighbours(now, &[known, restarted.clone()]);
+    exchange.handle_neighbors(now, &[known, restarted.clone()]);
     exchange.handle_letter(now, new, told).unwrap();
     assert!(directory.speaks_for(old));
     // It ends: its entries leave at once, and those of the new one are there.
-    exchange.handle_neighbours(now, std::slice::from_ref(&restarted));
+    exchange.handle_neighbors(now, std::slice::from_ref(&restarted));
     assert!(!directory.speaks_for(old));
     assert_eq!(gateway(), Some(new));
 
@@ -711,8 +711,8 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let newer = Incarnation::from_u64(78);
     let at = location(0).with_incarnation(newer);
     let started_again = Present::unproved(Mts::new("same-name-mts", newer), vec![at]);
-    exchange.handle_neighbours(now, &[]);
-    exchange.handle_neighbours(now, std::slice::from_ref(&started_again));
+    exchange.handle_neighbors(now, &[]);
+    exchange.handle_neighbors(now, std::slice::from_ref(&started_again));
     assert_eq!(gateway(), Some(new));
     exchange.handle_letter(now, newer, told).unwrap();
     assert_eq!(gateway(), Some(newer));
@@ -725,7 +725,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
         started_again,
         Present::unproved(Mts::new("same-name-mts", newest), vec![at]),
     ];
-    exchange.handle_neighbours(now, &both);
+    exchange.handle_neighbors(now, &both);
     let silent = location(0).with_incarnation(newer);
     assert!(!exchange.handle_silence(now, &silent));
     assert_eq!(
@@ -759,7 +759,7 @@ fn agents_of_a_disconnected_gateway_are_dropped_if_another_directory_has_them() 
         directory.lookup("arm").is_some(),
         "the gateway is connected"
     );
-    exchange.handle_neighbours(now, &[]);
+    exchange.handle_neighbors(now, &[]);
     exchange.leave_to_others(is_arm);
     assert!(directory.lookup("arm").is_none());
     assert!(directory.lookup("leg").is_some());
@@ -778,7 +778,7 @@ fn entries_that_arrived_too_early_are_requested_again() {
         world.gateways[1].mts.clone(),
         vec![location(1)],
     )];
-    world.gateways[0].exchange.handle_neighbours(now, &present);
+    world.gateways[0].exchange.handle_neighbors(now, &present);
     world.run(Duration::from_millis(200));
     assert!(!world.agrees());
     world.connect();
@@ -804,7 +804,7 @@ fn gateways_that_never_become_neighbors_keep_no_others_from_being_asked() {
         world.gateways[1].mts.clone(),
         vec![location(1)],
     )];
-    world.gateways[0].exchange.handle_neighbours(now, &present);
+    world.gateways[0].exchange.handle_neighbors(now, &present);
     world.run(Duration::from_millis(200));
     assert!(!world.agrees());
     world.connect();
@@ -815,7 +815,7 @@ fn gateways_that_never_become_neighbors_keep_no_others_from_being_asked() {
 /// A small letter costs no copy of all agents of its sender.
 #[test]
 fn the_agents_of_a_gateway_are_bounded_also_by_changes() {
-    let mut exchange = with_neighbour();
+    let mut exchange = with_neighbor();
     let from = Incarnation::from_u64(7);
     let agent = |number: usize| {
         format!(
@@ -875,7 +875,7 @@ fn the_agents_of_a_gateway_follow_its_location() {
     let elsewhere: Location = "tcp://10.0.0.99:1#0000000000000001".parse().unwrap();
     let (mts, now) = (world.gateways[0].mts.clone(), world.now);
     let present = [Present::unproved(mts, vec![elsewhere.clone()])];
-    world.gateways[1].exchange.handle_neighbours(now, &present);
+    world.gateways[1].exchange.handle_neighbors(now, &present);
     let entry = world.gateways[1]
         .exchange
         .directory()
@@ -902,7 +902,7 @@ fn the_agents_of_a_gateway_that_moves_all_the_time_follow_at_a_rate() {
         vec![text.parse().unwrap()]
     };
     let is_moved_to = |now: Instant, port: u16, exchange: &mut Exchange| {
-        exchange.handle_neighbours(now, &[Present::unproved(mts.clone(), at(port))]);
+        exchange.handle_neighbors(now, &[Present::unproved(mts.clone(), at(port))]);
         directory.lookup("agent_0").unwrap().locations == at(port)
     };
     let moves = (1..=100).filter(|port| is_moved_to(now, *port, exchange));
@@ -919,7 +919,7 @@ fn the_agents_of_a_gateway_that_moves_all_the_time_follow_at_a_rate() {
     assert!(is_moved_to(now + Duration::from_secs(9), 101, exchange));
     now += Duration::from_secs(9);
     while is_moved_to(now, 102, exchange) && is_moved_to(now, 103, exchange) {}
-    exchange.handle_neighbours(now, &[]);
+    exchange.handle_neighbors(now, &[]);
     assert!(
         exchange
             .poll_timeout()
@@ -1078,16 +1078,16 @@ fn told(exchange: &mut Exchange, content: &str) -> Result<(), ExchangeError> {
     exchange.handle_letter(Instant::now(), from, content.as_bytes())
 }
 
-fn with_neighbour() -> Exchange {
+fn with_neighbor() -> Exchange {
     let mut exchange = Exchange::new(0);
     let mts = Mts::new("hostile", Incarnation::from_u64(7));
-    exchange.handle_neighbours(Instant::now(), &[Present::unproved(mts, vec![location(6)])]);
+    exchange.handle_neighbors(Instant::now(), &[Present::unproved(mts, vec![location(6)])]);
     exchange
 }
 
 #[test]
 fn unknown_senders_and_malformed_letters_are_rejected() {
-    let mut exchange = with_neighbour();
+    let mut exchange = with_neighbor();
     let stranger = Incarnation::from_u64(8);
     let again = br#"{"version":1,"tell":"again"}"#;
     assert!(matches!(
@@ -1117,7 +1117,7 @@ fn unknown_senders_and_malformed_letters_are_rejected() {
 
 #[test]
 fn invalid_agents_are_left_out() {
-    let mut exchange = with_neighbour();
+    let mut exchange = with_neighbor();
     let agents = r#"[{"name":"","id":"0000000000000001","registered":1},
         {"name":"a\nb","id":"0000000000000001","registered":1},
         {"name":"arm_.*","id":"0000000000000001","registered":1},
@@ -1137,7 +1137,7 @@ fn invalid_agents_are_left_out() {
 
 #[test]
 fn the_number_of_agents_of_a_neighbor_is_bounded() {
-    let mut exchange = with_neighbour();
+    let mut exchange = with_neighbor();
     let part = |part: usize, last: bool| {
         let agents: Vec<String> = (0..5000)
             .map(|number| {
@@ -1191,7 +1191,7 @@ fn the_number_of_agents_of_a_neighbor_is_bounded() {
             )
         })
         .collect();
-    exchange.handle_neighbours(now, &crowd);
+    exchange.handle_neighbors(now, &crowd);
     let (known, _) = exchange.goodbye();
     assert_eq!(known.len(), Exchange::MAX_NEIGHBOURS);
 }
@@ -1257,7 +1257,7 @@ fn peers_with_the_longest_lists_are_cut_and_a_small_one_is_complete() {
     let mut exchange = Exchange::new(0);
     // Twelve hosts, and four more gateways at the last of them.
     let now = Instant::now();
-    exchange.handle_neighbours(now, &present((0..12).chain([11; 4])));
+    exchange.handle_neighbors(now, &present((0..12).chain([11; 4])));
     for liar in 2..=16 {
         tell_all(
             &mut exchange,
@@ -1291,7 +1291,7 @@ fn peers_with_the_longest_lists_are_cut_and_a_small_one_is_complete() {
     assert!(after <= of_host + 10, "{after} after {of_host}");
     // A list that was cut is requested again when others left.
     let later = now + Duration::from_secs(60);
-    exchange.handle_neighbours(later, &present([0, 1, 2]));
+    exchange.handle_neighbors(later, &present([0, 1, 2]));
     while let Some((to, _)) = exchange.poll_letter(later) {
         exchange.handle_sent(later, to, true);
     }
@@ -1323,10 +1323,10 @@ fn gateways_of_one_host_keep_no_other_host_from_being_a_neighbor() {
     let hosts = std::iter::repeat_n(1, Exchange::MAX_NEIGHBOURS).chain([2, 3, 2]);
     let all = present(hosts);
     let (crowd, others) = all.split_at(Exchange::MAX_NEIGHBOURS);
-    exchange.handle_neighbours(Instant::now(), crowd);
+    exchange.handle_neighbors(Instant::now(), crowd);
     tell_all(&mut exchange, 1, &full("crowd-", 10, 0));
     for _ in 0..3 {
-        exchange.handle_neighbours(Instant::now(), &all);
+        exchange.handle_neighbors(Instant::now(), &all);
         let (known, _) = exchange.goodbye();
         assert_eq!(known.len(), Exchange::MAX_NEIGHBOURS);
         assert!(others.iter().all(|it| known.contains(&it.mts.incarnation)));
@@ -1337,7 +1337,7 @@ fn gateways_of_one_host_keep_no_other_host_from_being_a_neighbor() {
 #[test]
 fn incomplete_lists_of_many_neighbors_are_bounded() {
     let mut exchange = Exchange::new(0);
-    exchange.handle_neighbours(Instant::now(), &present(0..20));
+    exchange.handle_neighbors(Instant::now(), &present(0..20));
     let never_ends: Vec<String> = full("x", 3000, 1000);
     for liar in 2..=20 {
         tell_all(&mut exchange, liar, &never_ends[..9]);
@@ -1356,7 +1356,7 @@ fn incomplete_lists_of_many_neighbors_are_bounded() {
 fn a_neighbor_gets_a_letter_every_15_seconds_without_changes() {
     let start = Instant::now();
     let mut exchange = Exchange::new(0);
-    exchange.handle_neighbours(start, &present([0]));
+    exchange.handle_neighbors(start, &present([0]));
     let (mut now, mut times) = (start, Vec::new());
     while now < start + Duration::from_secs(120) {
         now = exchange.poll_timeout().unwrap().max(now);
@@ -1377,7 +1377,7 @@ fn an_incomplete_list_ends_unless_it_grows() {
     let from = Incarnation::from_u64(1);
     let connected = || {
         let mut exchange = Exchange::new(0);
-        exchange.handle_neighbours(start, &present([0]));
+        exchange.handle_neighbors(start, &present([0]));
         // The own list goes to the neighbor.
         let first = start + Duration::from_secs(1);
         assert!(exchange.poll_letter(first).is_some());
@@ -1424,7 +1424,7 @@ fn an_incomplete_list_ends_unless_it_grows() {
 fn incomplete_lists_of_one_host_drop_no_list_of_another() {
     let mut exchange = Exchange::new(0);
     let hosts = std::iter::once(0).chain(std::iter::repeat_n(1, 64));
-    exchange.handle_neighbours(Instant::now(), &present(hosts));
+    exchange.handle_neighbors(Instant::now(), &present(hosts));
     let honest = full("honest-", 1500, 0);
     tell_all(&mut exchange, 1, &honest[..4]);
     for liar in 2..=65 {
@@ -1455,7 +1455,7 @@ fn full_with_df(agents: &[(String, String)]) -> String {
 
 #[test]
 fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
-    let mut exchange = with_neighbour();
+    let mut exchange = with_neighbor();
     let many: Vec<(String, String)> = (0..4500)
         .map(|number| (format!("a{number}"), r#"{"entry":"lifting"}"#.to_owned()))
         .collect();
@@ -1500,7 +1500,7 @@ fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
     let entries = directory.df_entries();
     assert!((1..=Exchange::MAX_DF_ENTRIES).contains(&entries.len()));
     assert!(entries.iter().all(|df| directory.known(&df.name).is_some()));
-    exchange.handle_neighbours(Instant::now(), &[]);
+    exchange.handle_neighbors(Instant::now(), &[]);
     exchange.handle_timeout(Instant::now() + Exchange::MEMORY);
     assert!(directory.df_entries().is_empty());
 }
@@ -1514,7 +1514,7 @@ fn df_entries_that_are_too_long_or_of_others_are_ignored() {
         principal: Principal::Certificate([7; 32]),
         ..Present::unproved(mts, vec![location(6)])
     };
-    exchange.handle_neighbours(Instant::now(), &[certified]);
+    exchange.handle_neighbors(Instant::now(), &[certified]);
     let df = |text: &str| format!(r#"{{"entry":"{text}"}}"#);
     let agents = [
         ("own_1".to_owned(), df("lifting")),

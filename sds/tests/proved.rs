@@ -46,16 +46,16 @@ fn present(gateway: u64, mandate: Mandate) -> Present {
 struct Bench {
     now: Instant,
     exchange: Exchange,
-    neighbours: Vec<Present>,
+    neighbors: Vec<Present>,
     versions: u64,
 }
 
 impl Bench {
-    fn new(neighbours: Vec<Present>) -> Self {
+    fn new(neighbors: Vec<Present>) -> Self {
         let mut bench = Self {
             now: Instant::now(),
             exchange: Exchange::new(0),
-            neighbours,
+            neighbors,
             versions: 0,
         };
         bench.connect();
@@ -63,7 +63,7 @@ impl Bench {
     }
 
     fn connect(&mut self) {
-        self.exchange.handle_neighbours(self.now, &self.neighbours);
+        self.exchange.handle_neighbors(self.now, &self.neighbors);
     }
 
     /// The gateway sends its list of agents, each with this time of registration.
@@ -109,7 +109,7 @@ fn agents_that_the_certificate_does_not_name_are_left_out() {
         .collect();
     assert_eq!(names, ["arm_1", "rover"]);
     // The user trusts another certificate of that gateway: it sends all agents again.
-    bench.neighbours = vec![present(1, certified(&["crex"]))];
+    bench.neighbors = vec![present(1, certified(&["crex"]))];
     bench.connect();
     assert_eq!(directory.entries().len(), 0);
     bench.tell(1, &["rover", "crex"], 5);
@@ -216,7 +216,7 @@ fn the_first_of_two_proved_claims_keeps_the_name_until_it_leaves() {
     // The same applies to an agent whose host is lost.
     bench.tell(1, &["rover"], 0);
     assert_eq!(bench.holder("rover"), Some(2));
-    bench.neighbours.remove(1);
+    bench.neighbors.remove(1);
     bench.connect();
     bench.exchange.handle_timeout(bench.now + Exchange::MEMORY);
     assert_eq!(bench.holder("rover"), Some(1));
@@ -270,7 +270,7 @@ fn a_gateway_that_restarts_at_another_address_takes_its_agents_back() {
         bench.tell(1, &["rover"], 5);
         bench.tell(2, &["rover"], 5);
         assert_eq!(bench.holder("rover"), Some(1), "both are connected");
-        bench.neighbours.remove(0);
+        bench.neighbors.remove(0);
         bench.connect();
         assert_eq!(bench.holder("rover"), Some(holder), "{name}");
     }
@@ -281,7 +281,7 @@ fn proved_agents_of_a_disconnected_gateway_are_kept() {
     for (mandate, stays) in [(Mandate::Unproved, false), (certified(&[]), true)] {
         let mut bench = Bench::new(vec![present(1, mandate)]);
         bench.tell(1, &["rover"], 5);
-        bench.neighbours.clear();
+        bench.neighbors.clear();
         bench.connect();
         bench.exchange.leave_to_others(|_| true);
         assert_eq!(bench.holder("rover").is_some(), stays);
@@ -399,7 +399,7 @@ fn a_gateway_that_lists_the_address_of_another_does_not_replace_it() {
     bench.tell(1, &["rover"], 5);
     bench.tell(2, &["crex"], 5);
     assert!(!bench.exchange.handle_silence(bench.now, &location(1)));
-    bench.neighbours.remove(0);
+    bench.neighbors.remove(0);
     bench.connect();
     assert_eq!(bench.holder("rover"), Some(1), "remembered for a while");
     bench.exchange.handle_timeout(bench.now + Exchange::MEMORY);
@@ -469,13 +469,13 @@ fn other_directories_cannot_say_more_of_a_gateway_than_its_certificate() {
     let view = merged(&bench, heard("crex", 1, 6));
     let mut watch = view.watch();
     assert!(view.known("crex").is_some());
-    bench.neighbours = vec![present(1, certified(&["rover"]))];
+    bench.neighbors = vec![present(1, certified(&["rover"]))];
     bench.connect();
     // A connection with the gateway proves that it does not speak for that name.
     assert!(view.known("crex").is_none());
     assert!(view.entries().is_empty());
     assert_eq!(watch.try_next(), Some(Change::Lagged));
-    bench.neighbours.clear();
+    bench.neighbors.clear();
     bench.connect();
     bench
         .exchange

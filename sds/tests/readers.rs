@@ -155,7 +155,7 @@ fn exchange() -> (Instant, Exchange, Arc<ExchangeDirectory>) {
             )
         })
         .collect();
-    exchange.handle_neighbours(now, &gateways);
+    exchange.handle_neighbors(now, &gateways);
     for (number, name) in (1..).zip(NAMES) {
         let id = number + 100;
         let told = format!(
@@ -194,7 +194,7 @@ fn entries_of_neighbors_conform() {
     let (now, mut exchange, directory) = exchange();
     conforms(&*directory, Source::Exchange);
     tells_departures(&*directory, || {
-        exchange.handle_neighbours(now, &[]);
+        exchange.handle_neighbors(now, &[]);
         exchange.handle_timeout(now + Exchange::MEMORY + Duration::from_millis(1));
     });
 }

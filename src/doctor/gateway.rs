@@ -45,7 +45,7 @@ pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &m
         }
     };
     checks.push(configuration(config, report));
-    checks.extend(report.neighbours.iter().map(connection));
+    checks.extend(report.neighbors.iter().map(connection));
     checks.extend(report.peers.iter().filter_map(static_peer));
     checks.extend(report.contested.iter().map(contested));
     let recent = report.refused.iter().filter(|it| it.seconds <= RECENT);
@@ -188,7 +188,7 @@ fn unconnected(config: &Config, report: &Report) -> Vec<(String, String)> {
         .flat_map(|peer| &peer.locations)
         .map(|location| location.address())
         .collect();
-    let connected = report.neighbours.iter().map(|it| it.incarnation);
+    let connected = report.neighbors.iter().map(|it| it.incarnation);
     let connected: BTreeSet<_> = connected.collect();
     let mut addresses = BTreeMap::new();
     for route in &report.routes {
@@ -221,7 +221,7 @@ mod tests {
     fn report(config: &Config) -> Report {
         let empty = serde_json::json!({
             "mts": "sherpa", "incarnation": "0000000000000001", "locations": [], "routes": [],
-            "ways": [], "peers": [], "neighbours": [],
+            "ways": [], "peers": [], "neighbors": [],
         });
         let mut report: Report = serde_json::from_value(empty).unwrap();
         report.configuration = config.values();

@@ -25,7 +25,7 @@ use tokio::task::JoinSet;
 use super::Network;
 use super::exchange_queues::{ExchangeQueues, Unread};
 use super::names::{Contested, contested, own_agents};
-use super::neighbours::{Neighbour, Neighbours};
+use super::neighbors::{Neighbor, Neighbors};
 use crate::background::{self, BackgroundError};
 use crate::routes::ContestedName;
 use crate::service::Service;
@@ -63,7 +63,7 @@ pub(super) struct Exchanging {
 pub(super) struct Means {
     pub(super) service: Arc<Service>,
     pub(super) id: AgentId,
-    pub(super) neighbours: Arc<Neighbours>,
+    pub(super) neighbors: Arc<Neighbors>,
     pub(super) network: Option<Arc<dyn Network>>,
     /// Whether `security.keys` is set.
     pub(super) has_keys: bool,
@@ -224,7 +224,7 @@ impl Exchanging {
                     }
                     own_changed = true;
                 }
-                () = means.neighbours.changed() => {}
+                () = means.neighbors.changed() => {}
                 () = self.wake.notified() => {}
                 Some(arrived) = sent.join_next() => {
                     if let Ok((to, arrived)) = arrived {
@@ -244,24 +244,24 @@ impl Exchanging {
     /// Updates the core and sends the letters that are due. Returns the time of the next call.
     fn work(&self, means: &Means, sent: &mut JoinSet<(Incarnation, bool)>) -> Option<Instant> {
         let now = Instant::now();
-        let neighbours = means.neighbours.all();
+        let neighbors = means.neighbors.all();
         let announced = means.network.clone().map(Network::directory);
-        let announced_at = announced_by(&neighbours, announced.as_deref());
-        let located = |neighbour: &Neighbour| {
-            let entry = &neighbour.entry;
+        let announced_at = announced_by(&neighbors, announced.as_deref());
+        let located = |neighbor: &Neighbor| {
+            let entry = &neighbor.entry;
             let others = announced_at.get(&entry.incarnation);
             let others = others.into_iter().flat_map(|other| &other.locations);
             Present {
                 mts: entry.mts.clone(),
                 locations: with_others(&entry.locations, others),
-                mandate: neighbour.mandate.clone(),
-                principal: neighbour.principal,
+                mandate: neighbor.mandate.clone(),
+                principal: neighbor.principal,
             }
         };
-        let present: Vec<Present> = neighbours.iter().map(located).collect();
+        let present: Vec<Present> = neighbors.iter().map(located).collect();
         let mut core = self.core.lock();
-        core.handle_neighbours(now, &present);
-        for (location, fault) in means.neighbours.take_doubted() {
+        core.handle_neighbors(now, &present);
+        for (location, fault) in means.neighbors.take_doubted() {
             if core.handle_silence(now, &location) {
                 if let Some(network) = &means.network {
                     network.ended(location.incarnation());
@@ -277,7 +277,7 @@ impl Exchanging {
         }
         core.handle_timeout(now);
         while let Some((to, content)) = core.poll_letter(now) {
-            let mut there = neighbours.iter().map(|neighbour| &neighbour.entry);
+            let mut there = neighbors.iter().map(|neighbor| &neighbor.entry);
             let entry = there.find(|entry| entry.incarnation == to);
             let sending = entry.and_then(|entry| means.send(entry, content, DEADLINE));
             sent.spawn(async move {
@@ -299,10 +299,10 @@ impl Exchanging {
     pub(super) async fn goodbye(&self, means: &Means) {
         let (to, content) = self.core.lock().goodbye();
         let mut sent = JoinSet::new();
-        for neighbour in means.neighbours.all() {
-            if to.contains(&neighbour.entry.incarnation)
+        for neighbor in means.neighbors.all() {
+            if to.contains(&neighbor.entry.incarnation)
                 && let Some(sending) =
-                    means.send(&neighbour.entry, content.clone(), GOODBYE_DEADLINE)
+                    means.send(&neighbor.entry, content.clone(), GOODBYE_DEADLINE)
             {
                 sent.spawn(sending.outcomes());
             }
@@ -350,10 +350,10 @@ impl Greetings {
             return;
         };
         let entries = Arc::clone(network).directory().entries();
-        let neighbours = means.neighbours.all();
-        let neighbours: HashSet<Incarnation> =
-            neighbours.iter().map(|it| it.entry.incarnation).collect();
-        let next = self.next(now, &entries, &neighbours);
+        let neighbors = means.neighbors.all();
+        let neighbors: HashSet<Incarnation> =
+            neighbors.iter().map(|it| it.entry.incarnation).collect();
+        let next = self.next(now, &entries, &neighbors);
         let oldest = self.greeted.values().min();
         self.not_before = (!next.is_empty()).then(|| now + Self::PAUSE);
         self.due = self.not_before.or(oldest.map(|at| *at + Self::AGAIN));
@@ -376,10 +376,10 @@ impl Greetings {
         &mut self,
         now: Instant,
         entries: &[Arc<Entry>],
-        neighbours: &HashSet<Incarnation>,
+        neighbors: &HashSet<Incarnation>,
     ) -> Vec<Arc<Entry>> {
         self.greeted.retain(|_, at| now < *at + Self::AGAIN);
-        let room = Self::NEIGHBOURS.saturating_sub(neighbours.len());
+        let room = Self::NEIGHBOURS.saturating_sub(neighbors.len());
         let room = room.min(Self::REMEMBERED.saturating_sub(self.greeted.len()));
         let mut next = Vec::new();
         for entry in entries {
@@ -390,7 +390,7 @@ impl Greetings {
             if entry.agent_type == Entry::DF_TYPE
                 && entry.is_platform_agent()
                 && gateway.is_known()
-                && !neighbours.contains(&gateway)
+                && !neighbors.contains(&gateway)
                 && !self.greeted.contains_key(&gateway)
             {
                 self.greeted.insert(gateway, now);
@@ -404,10 +404,10 @@ impl Greetings {
 /// Returns, for each neighbor, one entry that it announces. The locations of the entry are those of
 /// the neighbor.
 fn announced_by(
-    neighbours: &[Neighbour],
+    neighbors: &[Neighbor],
     announced: Option<&dyn Directory>,
 ) -> HashMap<Incarnation, Arc<Entry>> {
-    let gateways = neighbours.iter().map(|it| it.entry.incarnation);
+    let gateways = neighbors.iter().map(|it| it.entry.incarnation);
     let gateways: HashSet<Incarnation> = gateways.collect();
     let entries = announced.map(Directory::entries);
     let entries = entries.iter().flat_map(|entries| entries.iter());
@@ -506,7 +506,7 @@ impl Disputes {
                 "the name {name:?} is registered at {at:?} and at {by:?}: this host reaches the agent \
                  at {at:?}; deregister one of them"
             );
-            for gateway in means.neighbours.all() {
+            for gateway in means.neighbors.all() {
                 let known = gateway.entry.incarnation;
                 if known == holder.mts.incarnation || known == other.mts.incarnation {
                     drop(means.notify(&gateway.entry, &content));
@@ -657,8 +657,8 @@ mod tests {
         };
         let mut entries: Vec<_> = (1..=10).map(df).collect();
         entries.push(agent("rover", 7, 11));
-        let mut next = |seconds, entries: &[_], neighbours: &[u64]| {
-            let known = neighbours.iter().copied().map(Incarnation::from_u64);
+        let mut next = |seconds, entries: &[_], neighbors: &[u64]| {
+            let known = neighbors.iter().copied().map(Incarnation::from_u64);
             let now = begun + Duration::from_secs(seconds);
             let next = greetings.next(now, entries, &known.collect());
             let gateways = next.iter().map(|entry| entry.mts.incarnation.as_u64());

@@ -24,7 +24,7 @@ use super::KnownPeers;
 use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
 use super::introductions::Grounds;
 use super::namesakes::Namesakes;
-use super::neighbours::Neighbours;
+use super::neighbors::Neighbors;
 use super::presence::{QuestionRates, Questions};
 use crate::contact::{self, Introduced};
 use crate::presence;
@@ -41,7 +41,7 @@ const MAX_NOTICE: usize = 1024;
 pub(crate) struct GatewayAgent {
     pub(crate) service: Arc<Service>,
     pub(crate) id: AgentId,
-    pub(crate) neighbours: Arc<Neighbours>,
+    pub(crate) neighbors: Arc<Neighbors>,
     pub(crate) view: Arc<dyn Directory>,
     pub(super) exchange: Arc<Exchanging>,
     pub(super) contacts: Arc<KnownPeers>,
@@ -224,13 +224,13 @@ impl GatewayAgent {
 
     /// Logs a notice about a name that another gateway sent to the operator of this one.
     fn log_notice(&self, gateway: Incarnation, message: &Message) {
-        let all = self.neighbours.all();
-        if let Some(neighbour) = all.iter().find(|it| it.entry.incarnation == gateway) {
+        let all = self.neighbors.all();
+        if let Some(neighbor) = all.iter().find(|it| it.entry.incarnation == gateway) {
             let content = message.content().map(|content| &content[..]);
             let text = String::from_utf8_lossy(content.unwrap_or_default());
             let text: String = text.chars().take(MAX_NOTICE).collect();
-            let (gateway, notice) = (escape_name(&neighbour.entry.name), escape(&text));
-            log_limit::warn!(of: neighbour.entry.incarnation, %gateway, %notice, "another gateway reports a problem with a name");
+            let (gateway, notice) = (escape_name(&neighbor.entry.name), escape(&text));
+            log_limit::warn!(of: neighbor.entry.incarnation, %gateway, %notice, "another gateway reports a problem with a name");
         }
     }
 
@@ -253,9 +253,9 @@ impl GatewayAgent {
             _ => Query::all(),
         };
         let entries = routes::agents(&*self.view, &query);
-        let neighbours = self.neighbours.all().into_iter();
+        let neighbors = self.neighbors.all().into_iter();
         let report = routes::Report {
-            neighbours: neighbours.map(Into::into).collect(),
+            neighbors: neighbors.map(Into::into).collect(),
             refused: self.refusals.latest().into_iter().map(Into::into).collect(),
             refused_dials: self
                 .refused_dials

@@ -93,7 +93,7 @@ mod tests {
             mandate,
             principal: Principal::Certificate([7; 32]),
         };
-        exchange.handle_neighbours(Instant::now(), &[present]);
+        exchange.handle_neighbors(Instant::now(), &[present]);
         let told = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,
             "agents":[{"name":"rover","id":"0000000000000008","registered":1}]}}}"#;
         let taken = exchange.handle_letter(Instant::now(), gateway, told);

@@ -11,7 +11,7 @@ use fipa_acl::escape;
 use fipa_sds::{Directory, MergedDirectory, Mts, Reach};
 use fipa_transport::{Incarnation, Location, log_limit};
 
-use super::neighbours::{Neighbour, Neighbours};
+use super::neighbors::{Neighbor, Neighbors};
 use crate::routes;
 
 /// Time for which two gateways of one name must have been connected together. A gateway that was restarted has a
@@ -31,7 +31,7 @@ const MAX_GATEWAYS: usize = 8;
 pub(super) struct Namesakes {
     /// The service of this gateway.
     pub(super) own: Mts,
-    pub(super) neighbours: Arc<Neighbours>,
+    pub(super) neighbors: Arc<Neighbors>,
     /// The directories of other hosts.
     pub(super) known: Arc<MergedDirectory>,
     /// Whether `security.keys` is set. Then a claim that no connection proves is ignored.
@@ -49,13 +49,13 @@ struct Other {
 }
 
 impl Other {
-    fn connected(neighbour: &Neighbour) -> Option<Self> {
+    fn connected(neighbor: &Neighbor) -> Option<Self> {
         Some(Self {
-            name: neighbour.entry.name.to_string(),
-            incarnation: neighbour.entry.incarnation,
-            at: neighbour.entry.locations.first()?.clone(),
-            since: Some(neighbour.since),
-            is_proved: neighbour.mandate.is_proved(),
+            name: neighbor.entry.name.to_string(),
+            incarnation: neighbor.entry.incarnation,
+            at: neighbor.entry.locations.first()?.clone(),
+            since: Some(neighbor.since),
+            is_proved: neighbor.mandate.is_proved(),
         })
     }
 }
@@ -63,8 +63,8 @@ impl Other {
 impl Namesakes {
     /// Returns the names that several gateways have.
     pub(super) fn found(&self, now: Instant) -> Vec<routes::Namesakes> {
-        let neighbours = self.neighbours.all();
-        let others = neighbours.iter().filter_map(Other::connected);
+        let neighbors = self.neighbors.all();
+        let others = neighbors.iter().filter_map(Other::connected);
         let own = self.own.name.as_deref().unwrap_or_default();
         found(now, own, others.chain(self.announced(own)))
     }
@@ -107,7 +107,7 @@ impl Namesakes {
             for found in self.found(Instant::now()) {
                 let routes::Namesakes { name, is_own, .. } = &found;
                 // A connected gateway with the name of this one is logged when it connects.
-                let is_logged = *is_own && self.neighbours.has_namesake();
+                let is_logged = *is_own && self.neighbors.has_namesake();
                 if is_logged || logged.len() >= MAX_NAMES || !logged.insert(name.clone()) {
                     continue;
                 }

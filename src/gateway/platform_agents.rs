@@ -27,7 +27,7 @@ use tokio::task::{JoinHandle, JoinSet};
 
 use super::exchange::Exchanging;
 use super::names::other_claim;
-use super::neighbours::Neighbours;
+use super::neighbors::Neighbors;
 use super::state::{Predecessor, StateFile};
 use crate::config;
 use crate::service::Service;
@@ -52,7 +52,7 @@ const _: () = assert!(Exchange::MAX_DF_LEASE.as_secs() == limits::LEASE.as_secs(
 #[derive(Clone)]
 pub(super) struct PlatformAgents {
     pub(super) service: Arc<Service>,
-    pub(super) neighbours: Arc<Neighbours>,
+    pub(super) neighbors: Arc<Neighbors>,
     pub(super) view: Arc<dyn Directory>,
     /// The agents of other hosts.
     pub(super) known: Arc<MergedDirectory>,
@@ -125,7 +125,7 @@ impl PlatformAgents {
         if entry.reach == Reach::Local && !received.remote {
             return Platform::Host;
         }
-        match self.neighbours.principal(received.service) {
+        match self.neighbors.principal(received.service) {
             Some(Principal::Certificate(fingerprint)) => Platform::Proved(fingerprint),
             _ => Platform::Unproved,
         }

@@ -330,9 +330,9 @@ impl GatewayAgent {
 
     /// Returns an entry of a gateway: of the neighbor, or with the locations of one of its agents.
     fn entry_of_gateway(&self, gateway: Incarnation, asked: &[Asked]) -> Option<Arc<Entry>> {
-        let neighbours = self.neighbours.all().into_iter();
-        let mut neighbours = neighbours.map(|neighbour| neighbour.entry);
-        if let Some(entry) = neighbours.find(|entry| entry.incarnation == gateway) {
+        let neighbors = self.neighbors.all().into_iter();
+        let mut neighbors = neighbors.map(|neighbor| neighbor.entry);
+        if let Some(entry) = neighbors.find(|entry| entry.incarnation == gateway) {
             return Some(entry);
         }
         let mut agents = asked

@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 use tokio::runtime::Handle;
 use tokio::sync::Notify;
 
-use super::neighbours::Neighbours;
+use super::neighbors::Neighbors;
 use crate::background;
 use crate::domain_dir::DomainDir;
 
@@ -304,7 +304,7 @@ pub(super) struct StateFile {
     trust: Trust,
     view: Arc<dyn Directory>,
     contacts: Arc<ContactDirectory>,
-    neighbours: Arc<Neighbours>,
+    neighbors: Arc<Neighbors>,
     kept: Mutex<Kept>,
     changed: Notify,
     /// The lines in the file; `None` after the end of the gateway.
@@ -317,7 +317,7 @@ impl StateFile {
         trust: Trust,
         view: Arc<dyn Directory>,
         contacts: Arc<ContactDirectory>,
-        neighbours: Arc<Neighbours>,
+        neighbors: Arc<Neighbors>,
     ) -> Self {
         let boot = fs::read_to_string("/proc/sys/kernel/random/boot_id");
         Self {
@@ -326,7 +326,7 @@ impl StateFile {
             trust,
             view,
             contacts,
-            neighbours,
+            neighbors,
             kept: Mutex::default(),
             changed: Notify::new(),
             written: Mutex::new(Some(Vec::new())),
@@ -522,7 +522,7 @@ impl StateFile {
     }
 
     fn contact(&self, entry: &Entry) -> Option<Item> {
-        let certificate = match self.neighbours.principal(entry.mts.incarnation) {
+        let certificate = match self.neighbors.principal(entry.mts.incarnation) {
             Some(Principal::Certificate(certificate)) => Some(certificate),
             _ => None,
         };

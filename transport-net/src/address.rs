@@ -396,7 +396,7 @@ pub(crate) fn itself(address: SocketAddr) -> String {
 /// connection, with a port from its listening addresses.
 ///
 /// No other part of the listening addresses is used: a peer may list addresses of third parties,
-/// which must not be dialled for that reason. The port is that of the same address when it is
+/// which must not be dialed for that reason. The port is that of the same address when it is
 /// listed; else that of an unspecified address, when the peer listens on all of its addresses and
 /// may have got this one since it made the list; else that of the first other address, when the
 /// peer is known under another one (address translation). A loopback address is ignored for a

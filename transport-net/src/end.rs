@@ -17,7 +17,7 @@ pub(crate) enum ConnectionEnd {
     },
     /// The peer is this service itself: the address leads back here.
     Itself,
-    /// The peer dialled another incarnation than this one.
+    /// The peer dialed another incarnation than this one.
     NotSought,
     /// The peer violated the protocol.
     ProtocolViolation(String),
@@ -220,7 +220,7 @@ impl ConnectionEnd {
             ),
             Self::NotSought => (
                 TransportErrorKind::Broken,
-                "the peer dialled another service",
+                "the peer dialed another service",
             ),
             Self::ProtocolViolation(what) => (TransportErrorKind::Broken, what.as_str()),
             Self::TooSlow(what) => (TransportErrorKind::TimedOut, *what),

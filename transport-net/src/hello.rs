@@ -2,7 +2,7 @@
 //!
 //! A fixed part of 28 bytes, little-endian (incarnation 8, largest letter 8, maximum number of
 //! parcels in flight 4, serial number of this connection 8), then texts, each preceded by its
-//! length in two bytes: name, domain, host, the location that was dialled (empty from the side that
+//! length in two bytes: name, domain, host, the location that was dialed (empty from the side that
 //! accepted), and then, after their number in one byte, the addresses that the endpoint listens on.
 //! On a connection for [large letters](Load::Large), a byte 1 follows. Later versions may append bytes, which are
 //! ignored.
@@ -56,11 +56,11 @@ pub(crate) struct Hello {
     pub(crate) max_in_flight: u32,
     /// Increases with every connection that this endpoint opens.
     pub(crate) serial: u64,
-    /// The location that the dialling side opened this connection for.
-    pub(crate) dialled: String,
+    /// The location that the dialing side opened this connection for.
+    pub(crate) dialed: String,
     /// Addresses the endpoint listens on, best first.
     pub(crate) listening: Vec<String>,
-    /// The letters that the dialling side opened this connection for.
+    /// The letters that the dialing side opened this connection for.
     pub(crate) load: Load,
 }
 
@@ -77,7 +77,7 @@ impl Hello {
         let Identity {
             name, domain, host, ..
         } = &self.identity;
-        for text in [name, domain, host, &self.dialled] {
+        for text in [name, domain, host, &self.dialed] {
             put_text(&mut out, text);
         }
         let told = self.listening.iter().take(MAX_LISTENING);
@@ -101,7 +101,7 @@ impl Hello {
             domain: text(&mut rest, Identity::MAX_TEXT)?,
             host: text(&mut rest, Identity::MAX_TEXT)?,
         };
-        let dialled = text(&mut rest, MAX_DIALLED)?;
+        let dialed = text(&mut rest, MAX_DIALLED)?;
         let (&count, after) = rest.split_first()?;
         rest = after;
         if usize::from(count) > MAX_LISTENING {
@@ -119,7 +119,7 @@ impl Hello {
             max_letter: fixed.max_letter.get(),
             max_in_flight: fixed.max_in_flight.get(),
             serial: fixed.serial.get(),
-            dialled,
+            dialed,
             listening,
             load,
         })
@@ -158,7 +158,7 @@ pub(crate) mod tests {
             max_letter: 1 << 20,
             max_in_flight: 8,
             serial: 3,
-            dialled: "tcp://10.0.0.2:7788".into(),
+            dialed: "tcp://10.0.0.2:7788".into(),
             listening: vec!["10.0.0.1:7788".into(), "[::1]:7788".into()],
             load: Load::Any,
         }
@@ -190,7 +190,7 @@ pub(crate) mod tests {
     #[test]
     fn the_longest_hello_fits() {
         let mut hello = sample(7);
-        hello.dialled = "x".repeat(MAX_DIALLED);
+        hello.dialed = "x".repeat(MAX_DIALLED);
         hello.listening = vec!["x".repeat(Location::MAX_ADDRESS); MAX_LISTENING + 1];
         let body = hello.encode();
         assert!(body.len() <= MAX_HELLO);

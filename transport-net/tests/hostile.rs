@@ -434,7 +434,7 @@ fn half_letters_stay_within_the_memory_budget_and_block_no_peer() {
     for attempt in 1..=3 {
         assert_eq!(honest.conclusion(attempt), accepted());
     }
-    assert_eq!(honest.transport.counters().dialled, 1);
+    assert_eq!(honest.transport.counters().dialed, 1);
     assert!(party.lent().1 <= 2 * EACH, "{:?}", party.lent());
     let shut_out = rogues.into_iter().map(|rogue| rogue.join().unwrap());
     assert!(shut_out.filter(|out| *out).count() >= 2);
@@ -525,7 +525,7 @@ fn an_unproved_peer_that_claims_a_connected_service_is_refused_while_that_respon
     let counters = party.transport.counters();
     assert_eq!((counters.connections, counters.refused_unproved), (1, 2));
     service.assert_reaches(2, &party);
-    assert_eq!(service.transport.counters().dialled, 1);
+    assert_eq!(service.transport.counters().dialed, 1);
     assert_eq!(party.arrivals(), 2);
 }
 

@@ -127,7 +127,7 @@ fn a_connection_outlives_a_change_of_address() {
     let record = to.sink.record.lock();
     let arrived: Vec<u64> = record.arrivals.iter().map(|it| it.0.sequence).collect();
     assert_eq!(arrived, (1..=30).collect::<Vec<_>>());
-    assert_eq!(from.transport.counters().dialled, 1, "the same connection");
+    assert_eq!(from.transport.counters().dialed, 1, "the same connection");
     assert_eq!(to.transport.counters().accepted, 1);
 }
 
@@ -178,7 +178,7 @@ fn malformed_packets_have_no_effect() {
         let _ = hostile.send_to(&packet, at);
     }
     from.assert_reaches(2, &to);
-    assert_eq!(from.transport.counters().dialled, 1);
+    assert_eq!(from.transport.counters().dialed, 1);
 }
 
 #[test]

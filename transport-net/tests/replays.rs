@@ -49,7 +49,7 @@ fn securities() -> (Security, Security) {
     (rover.security(&[&crex]), crex.security(&[&rover]))
 }
 
-/// The recorded bytes of both sides of one TCP connection: the dialling side, and the accepting
+/// The recorded bytes of both sides of one TCP connection: the dialing side, and the accepting
 /// side.
 type Recording = JoinHandle<[Vec<u8>; 2]>;
 
@@ -126,7 +126,7 @@ fn a_replayed_tls_connection_delivers_nothing() {
     player.join().unwrap();
 }
 
-/// A relay between two QUIC endpoints that forwards every datagram of the dialling one twice, and
+/// A relay between two QUIC endpoints that forwards every datagram of the dialing one twice, and
 /// records them.
 struct Repeater {
     front: Location,
@@ -213,7 +213,7 @@ fn replayed_quic_datagrams_deliver_nothing() {
     repeater.repeat(&behind);
     sends(LETTERS + 1..=2 * LETTERS);
     assert_eq!(to.arrivals() as u64, 2 * LETTERS);
-    assert_eq!(from.transport.counters().dialled, 1);
+    assert_eq!(from.transport.counters().dialed, 1);
     // when it is over,
     fipa_transport::Transport::close(&from.transport);
     until_some("the connection is over", || {

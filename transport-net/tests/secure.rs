@@ -166,7 +166,7 @@ fn peers_that_trust_each_other_exchange_letters_of_any_size<T: Proving>() {
     let arrived = to.sink.record.lock().arrivals[1].0.clone();
     assert_eq!(arrived, parcel(2, large));
     // One for all parcels and one for large letters.
-    assert_eq!(from.transport.counters().dialled, 2);
+    assert_eq!(from.transport.counters().dialed, 2);
 }
 
 fn untrusted_peers_are_refused_on_either_side<T: Proving>() {
@@ -372,7 +372,7 @@ fn a_new_key_takes_over_while_letters_pass<T: Proving>() {
     security.replace(renewed.credentials(&[&rover])).unwrap();
     from.assert_reaches(2, &to);
     assert_eq!(
-        from.transport.counters().dialled,
+        from.transport.counters().dialed,
         1,
         "the connection has stayed"
     );

@@ -132,7 +132,7 @@ fn one_connection_serves_both_directions_even_without_a_listener() {
     assert_eq!(b.conclusion(1), accepted());
     assert_eq!(silent.arrivals(), 1);
     let counters = b.transport.counters();
-    assert_eq!((counters.accepted, counters.dialled), (1, 0));
+    assert_eq!((counters.accepted, counters.dialed), (1, 0));
     assert_eq!(counters.connections, 1);
 }
 
@@ -214,7 +214,7 @@ fn an_idle_connection_closes_and_opens_again() {
             (open(&a) == 0 && open(&b) == 0).then_some(())
         });
     }
-    assert_eq!(a.transport.counters().dialled, 3);
+    assert_eq!(a.transport.counters().dialed, 3);
     assert_eq!(b.transport.counters().refused_nonsense, 0);
 }
 

@@ -169,7 +169,7 @@ fn a_letter_that_the_dialect_cannot_express_is_concluded_later_as_not_sent() {
     assert_eq!(fault(&all[0].1), TransportErrorKind::Inexpressible);
     let counters = sender.transport.counters();
     assert_eq!(
-        (counters.connections, counters.dialled),
+        (counters.connections, counters.dialed),
         (0, 0),
         "for nothing"
     );
@@ -256,7 +256,7 @@ fn letters_arrive_in_the_order_of_dispatch_however_long_their_translation_takes(
         assert_eq!(sender.conclusion(number), Conclusion::Handed);
     }
     assert_eq!(contents(&receiver, 40), sent);
-    assert_eq!(sender.transport.counters().dialled, 1);
+    assert_eq!(sender.transport.counters().dialed, 1);
 }
 
 #[test]

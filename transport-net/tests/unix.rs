@@ -51,8 +51,8 @@ fn letters_go_both_ways_in_a_directory_with_a_long_path() {
     a.assert_reaches(1, &b);
     b.assert_reaches(1, &a);
     // Over the same connection, whichever side opened it.
-    assert_eq!(a.transport.counters().dialled, 1);
-    assert_eq!(b.transport.counters().dialled, 0);
+    assert_eq!(a.transport.counters().dialed, 1);
+    assert_eq!(b.transport.counters().dialed, 0);
     let (_, from, _) = b.sink.record.lock().arrivals.remove(0);
     assert_eq!(&from.location, a.location());
     assert!(!from.is_remote());
@@ -174,7 +174,7 @@ fn a_removed_socket_is_created_again_and_connections_stay() {
     let c = party(&directory);
     c.assert_reaches(1, &b);
     a.assert_reaches(4, &c);
-    assert_eq!(a.transport.counters().dialled, 2);
+    assert_eq!(a.transport.counters().dialed, 2);
     a.transport.close();
     assert!(!a.transport.rejoin().unwrap(), "it is closed");
 }

@@ -222,7 +222,7 @@ pub struct Introduction {
     /// Location of the service, with its incarnation.
     pub hop: Hop,
     /// The location that this side connected to. `None` if the other side opened the connection.
-    pub dialled: Option<Location>,
+    pub dialed: Option<Location>,
     /// The agents that the service may speak for on this connection.
     pub mandate: Mandate,
 }

@@ -261,13 +261,13 @@ impl Reported {
             let Some(report) = report.ok().flatten() else {
                 break;
             };
-            let neighbours = report.neighbours.into_iter();
+            let neighbors = report.neighbors.into_iter();
             reported.gateway = report.incarnation;
             reported.addresses = report.locations;
             let is_foreign = |at: &Location| at.signature() != Signature::Frames;
             reported.addresses.retain(is_foreign);
-            reported.links = neighbours
-                .map(|neighbour| (neighbour.incarnation, neighbour.security))
+            reported.links = neighbors
+                .map(|neighbor| (neighbor.incarnation, neighbor.security))
                 .collect();
             reported
                 .legacy

@@ -53,7 +53,7 @@ JSON:
                 \"failed\", \"last_error\", \"last_error_seconds\" } ],
     \"peers\": [ { \"name\", \"answers\": location or null, \"failures\": [ [ location, text ] ],
                  \"asked_again_in\": milliseconds or null } ],
-    \"neighbours\": [ { \"name\", \"incarnation\", \"locations\", \"connections\", \"seconds\",
+    \"neighbors\": [ { \"name\", \"incarnation\", \"locations\", \"connections\", \"seconds\",
                       \"security\": { \"encrypted\": true or false,
                                     \"certificate\": fingerprint or null } } ],
     \"configuration\": { key: value as TOML } of a gateway }")]
@@ -172,14 +172,14 @@ fn gateway_described(gateway: &Report) -> String {
             escape_name(&peer.name)
         ));
     }
-    if !gateway.neighbours.is_empty() {
-        text.push_str(&connections(&gateway.neighbours));
+    if !gateway.neighbors.is_empty() {
+        text.push_str(&connections(&gateway.neighbors));
     }
     text
 }
 
 /// The connected gateways, whether letters to them are encrypted, and the certificates that they proved.
-fn connections(neighbours: &[Connected]) -> String {
+fn connections(neighbors: &[Connected]) -> String {
     let mut table = output::table([
         "CONNECTED TO",
         "FOR",
@@ -187,7 +187,7 @@ fn connections(neighbours: &[Connected]) -> String {
         "CERTIFICATE",
         "LOCATIONS",
     ]);
-    for neighbor in neighbours {
+    for neighbor in neighbors {
         let locations = neighbor.locations.iter().map(ToString::to_string);
         let locations: Vec<String> = locations.collect();
         let since = humantime::format_duration(Duration::from_secs(neighbor.seconds));

@@ -1035,8 +1035,8 @@ impl Core {
     /// Handles the end of a connection that was opened for this location.
     pub fn handle_parted(&mut self, now: Now, peer: &Introduction) {
         self.principals.parted(peer);
-        if let Some(dialled) = &peer.dialled {
-            self.peers.parted(now.instant, dialled);
+        if let Some(dialed) = &peer.dialed {
+            self.peers.parted(now.instant, dialed);
         }
     }
 

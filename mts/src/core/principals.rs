@@ -363,7 +363,7 @@ mod tests {
         Introduction {
             name: name.into(),
             hop: hop(SERVICE, principal),
-            dialled: None,
+            dialed: None,
             mandate: Mandate::Unproved,
         }
     }

@@ -202,7 +202,7 @@ impl World {
                 location: way(Kind::Tcp, incarnation, address),
                 principal: certificate(host),
             },
-            dialled: None,
+            dialed: None,
             mandate: Mandate::Certified([].into()),
         }
     }
@@ -603,7 +603,7 @@ impl World {
                 location: way(Kind::Tcp, service, 0),
                 principal: certificate(self.processes[liar].host),
             },
-            dialled: None,
+            dialed: None,
             mandate: Mandate::Certified([].into()),
         };
         self.trace(|| format!("{liar} introduces itself to {target} as {service}"));

@@ -357,7 +357,7 @@ impl Exchange {
     }
 
     /// Sets the gateways that are connected now.
-    pub fn handle_neighbours(&mut self, now: Instant, present: &[Present]) {
+    pub fn handle_neighbors(&mut self, now: Instant, present: &[Present]) {
         // The connection is about to end.
         let is_withdrawn =
             |it: &Present| self.withdrawn.get(&it.mts.incarnation) == Some(&it.principal);

@@ -3,14 +3,14 @@
 //! * [`endpoint`]: the tasks around a protocol without sockets and clock ([`Protocol`]), with their
 //!   [`socket`]s.
 //! * [`connections`]: the connections of an endpoint, and the order in which they act.
-//! * [`cookie`]: the address validation of unproved peers. [`dialling`]: the handshake of the
-//!   dialling side.
+//! * [`cookie`]: the address validation of unproved peers. [`dialing`]: the handshake of the
+//!   dialing side.
 //!
 //! The protocols themselves are in [`crate::udp`] and `crate::udt`.
 
 pub(crate) mod connections;
 pub(crate) mod cookie;
-pub(crate) mod dialling;
+pub(crate) mod dialing;
 pub(crate) mod endpoint;
 pub(crate) mod socket;
 

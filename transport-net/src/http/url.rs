@@ -15,7 +15,7 @@ pub(super) const PATH: &str = "/acc";
 /// The address of a platform.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Url {
-    /// Host and port, as needed for dialling.
+    /// Host and port, as needed for dialing.
     target: String,
     path: String,
     scheme: Kind,
@@ -50,7 +50,7 @@ impl Url {
         })
     }
 
-    /// Host and port, for dialling.
+    /// Host and port, for dialing.
     pub(super) fn target(&self) -> &str {
         &self.target
     }

@@ -1,4 +1,4 @@
-//! The dialling side: opens a connection to a location.
+//! The dialing side: opens a connection to a location.
 
 use std::io;
 use std::net::SocketAddr;

@@ -9,9 +9,9 @@
 //! * `settings`: transport parameters.
 //! * [`dial`] and [`accept`] open connections.
 //!
-//! A connection survives a change of address of the dialling side: peers identify it by its number,
+//! A connection survives a change of address of the dialing side: peers identify it by its number,
 //! and follow it once the new address has been validated (RFC 9000 section 9). When the accepting
-//! side moves, it falls silent and is dialled again. Datagrams are not used, nor is early data,
+//! side moves, it falls silent and is dialed again. Datagrams are not used, nor is early data,
 //! which could be replayed.
 
 mod accept;
@@ -131,8 +131,8 @@ impl Transport for QuicTransport {
         self.endpoint.check(to, &parcel)?;
         self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
             let (endpoint, sockets) = (self.endpoint.clone(), self.sockets.clone());
-            let dialling = dial::dial(endpoint, sockets, link, sink, to.clone());
-            self.endpoint.runtime.spawn(dialling)
+            let dialing = dial::dial(endpoint, sockets, link, sink, to.clone());
+            self.endpoint.runtime.spawn(dialing)
         })
     }
 

@@ -87,7 +87,7 @@ pub(super) fn server(
     Ok(server)
 }
 
-/// Returns the configuration for dialling, with the present credentials.
+/// Returns the configuration for dialing, with the present credentials.
 pub(super) fn client(
     security: &Security,
     transport: &Arc<TransportConfig>,

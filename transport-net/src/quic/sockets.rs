@@ -1,4 +1,4 @@
-//! The sockets of an endpoint: the listening ones, and one per address family for dialling.
+//! The sockets of an endpoint: the listening ones, and one per address family for dialing.
 //!
 //! The latter are bound to no address, so that packets leave from any address of the host:
 //! connections survive a change of address.
@@ -27,7 +27,7 @@ pub(super) struct Sockets {
     security: Security,
     transport: Arc<TransportConfig>,
     /// For IPv4 and IPv6; opened on demand.
-    dialling: Mutex<[Option<Endpoint>; 2]>,
+    dialing: Mutex<[Option<Endpoint>; 2]>,
 }
 
 impl Sockets {
@@ -35,7 +35,7 @@ impl Sockets {
         Self {
             security,
             transport: settings::transport(limits),
-            dialling: Mutex::default(),
+            dialing: Mutex::default(),
         }
     }
 
@@ -59,8 +59,8 @@ impl Sockets {
     pub(super) fn dial(&self, to: SocketAddr) -> io::Result<Connecting> {
         let client = settings::client(&self.security, &self.transport).map_err(io::Error::other)?;
         let socket = {
-            let mut dialling = self.dialling.lock();
-            let [v4, v6] = &mut *dialling;
+            let mut dialing = self.dialing.lock();
+            let [v4, v6] = &mut *dialing;
             let (place, any) = match to {
                 SocketAddr::V4(_) => (v4, SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0))),
                 SocketAddr::V6(_) => (v6, SocketAddr::from((Ipv6Addr::UNSPECIFIED, 0))),
@@ -86,7 +86,7 @@ impl Sockets {
 
     /// Releases the sockets; connections that are closing keep them until they have ended.
     pub(super) fn close(&self) {
-        *self.dialling.lock() = [None, None];
+        *self.dialing.lock() = [None, None];
     }
 }
 

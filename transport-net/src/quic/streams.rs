@@ -1,6 +1,6 @@
 //! The streams of one connection.
 //!
-//! The dialling side opens one bidirectional stream for hello, answers, pings and goodbye. Every
+//! The dialing side opens one bidirectional stream for hello, answers, pings and goodbye. Every
 //! parcel has a stream of its own. Parcels are read in the order in which their streams were
 //! opened, because letters to one location must arrive in order. Streams that have arrived and are
 //! not read yet wait in the windows of [`super::settings`]. So an answer never waits behind a
@@ -313,7 +313,7 @@ impl Outgoing {
 }
 
 impl StreamWriter for Outgoing {
-    /// Returns the local address that the peer dialled. A connection that this side dialled has
+    /// Returns the local address that the peer dialed. A connection that this side dialed has
     /// none: it survives a change of address (RFC 9000 section 9).
     fn local_ip(&self) -> Option<IpAddr> {
         self.connection.local_ip()

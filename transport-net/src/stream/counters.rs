@@ -31,7 +31,7 @@ counters! {
     /// Connections that are open now and whose peer has introduced itself.
     connections,
     /// Connections opened by this side whose peer has introduced itself.
-    dialled,
+    dialed,
     /// Connections opened by peers that introduced themselves.
     accepted,
     /// Connections that could not be opened.

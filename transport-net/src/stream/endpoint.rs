@@ -2,14 +2,14 @@
 //!
 //! A location keeps its connection until that connection ends, so that order is preserved. A
 //! location with a known incarnation uses any connection with that incarnation, opened by either
-//! side; this is how reports reach peers that cannot be dialled. When two endpoints connect to each
+//! side; this is how reports reach peers that cannot be dialed. When two endpoints connect to each
 //! other at the same time both connections are kept, and the unused one closes after the idle
 //! timeout.
 //!
 //! Between hosts, large letters take a connection of their own, so that they do not delay the other parcels in
 //! either direction. So do the small letters that follow a large one in its stream, until it is answered; a large one
 //! begins when those before it in its stream are answered. Without such a connection, for example because
-//! the peer cannot be dialled, large letters take the one for all parcels.
+//! the peer cannot be dialed, large letters take the one for all parcels.
 //!
 //! A connection is *suspect* after an attempt on it got no answer and no other byte arrived either:
 //! the system retransmits lost packets with growing pauses, and a peer that moved never answers.
@@ -99,13 +99,13 @@ struct Registry {
     listening: Reached,
     /// The tasks that accept connections, and the one that watches the interfaces.
     listeners: Vec<AbortHandle>,
-    /// Connections that were dialled, or whose peer has said hello.
+    /// Connections that were dialed, or whose peer has said hello.
     links: HashMap<u32, Arc<Link>>,
     /// The connections for all parcels.
     any: Connections,
     /// The connections for large letters.
     large: Connections,
-    /// The latest connection of each peer for each location that the peer dialled, with the peer's
+    /// The latest connection of each peer for each location that the peer dialed, with the peer's
     /// serial number.
     inbound: HashMap<Inbound, (u64, Arc<Link>)>,
     /// The quota keys of the accepted connections.
@@ -123,7 +123,7 @@ struct Registry {
 #[derive(Default)]
 struct Connections {
     /// Those opened by this side, by location.
-    dialled: HashMap<Location, Arc<Link>>,
+    dialed: HashMap<Location, Arc<Link>>,
     /// Those with the service of an incarnation, in the order of introduction.
     known: HashMap<Incarnation, Vec<Arc<Link>>>,
     /// Locations for which connections were opened beside suspect ones or, for large letters, could not be opened.
@@ -188,9 +188,9 @@ struct Peer {
     proved: Option<Principal>,
     /// The origin of its connection.
     home: Home,
-    /// The location that the peer dialled and the serial number of that dialling, if the peer
+    /// The location that the peer dialed and the serial number of that dialing, if the peer
     /// opened the connection.
-    dialled: Option<(String, u64)>,
+    dialed: Option<(String, u64)>,
     /// The letters that the connection is for.
     load: Load,
     /// The listening addresses in its hello.
@@ -215,7 +215,7 @@ struct SupersededConnections {
 struct Inbound {
     incarnation: Incarnation,
     home: Home,
-    dialled: String,
+    dialed: String,
     load: Load,
 }
 
@@ -239,7 +239,7 @@ impl Peer {
             return (&this.name, &this.domain, &this.host)
                 == (&that.name, &that.domain, &that.host);
         }
-        match (&self.dialled, &before.dialled) {
+        match (&self.dialed, &before.dialed) {
             // An unproved peer at another address may or may not be the service, whatever its hello says.
             (Some(_), _) if self.proved.is_none() && self.home != before.home => true,
             (Some((this, serial)), Some((that, earlier))) => {
@@ -298,16 +298,16 @@ impl Endpoint {
     }
 
     /// Counts, logs and lists a connection that ends because the peer has another version of the protocol.
-    /// `dialled` is the location that this side dialled, if it opened the connection.
+    /// `dialed` is the location that this side dialed, if it opened the connection.
     pub(crate) fn other_version(
         &self,
         from: Source,
-        dialled: Option<&Location>,
+        dialed: Option<&Location>,
         end: &ConnectionEnd,
     ) {
         count(&self.tally.refused_nonsense);
         let (why, key) = (end.after().detail, from.home().whole());
-        if let Some(to) = dialled {
+        if let Some(to) = dialed {
             log_limit::warn!(of: key, "{to}: connection closed: {why}");
             return;
         }
@@ -663,8 +663,8 @@ impl Endpoint {
         let without_new = || open().chain(for_all()).next();
         let link = healthy.or_else(|| without_new().filter(|_| is_full || is_soon()));
         if let Some(link) = link.cloned() {
-            let dialled = connections.dialled.get(to);
-            if dialled.is_none_or(|dialled| !Arc::ptr_eq(dialled, &link)) {
+            let dialed = connections.dialed.get(to);
+            if dialed.is_none_or(|dialed| !Arc::ptr_eq(dialed, &link)) {
                 drop(registry);
                 link.is_used_for(to);
             }
@@ -685,8 +685,8 @@ impl Endpoint {
         }
         link.opened_beside(suspect);
         registry.links.insert(link.number, link.clone());
-        let dialled = &mut registry.of_mut(load).dialled;
-        dialled.insert(to.clone(), link.clone());
+        let dialed = &mut registry.of_mut(load).dialed;
+        dialed.insert(to.clone(), link.clone());
         Ok(Route::New(link, sink))
     }
 
@@ -730,7 +730,7 @@ impl Endpoint {
         };
         let links = [&registry.any, &registry.large].into_iter().flat_map(|it| {
             let known = it.known_of(location).filter(is_there);
-            known.chain(it.dialled.get(location)).cloned()
+            known.chain(it.dialed.get(location)).cloned()
         });
         let links: Vec<_> = links.collect();
         drop(registry);
@@ -753,14 +753,14 @@ impl Endpoint {
         role: Role,
         load: Load,
         serial: u64,
-        dialled: String,
+        dialed: String,
     ) -> Arc<Link> {
         let hello = Hello {
             identity: self.config.identity.clone(),
             max_letter: self.limits().max_letter as u64,
             max_in_flight: u32::try_from(self.limits().max_in_flight.max(1)).unwrap_or(u32::MAX),
             serial,
-            dialled,
+            dialed,
             listening: registry.listening.texts(),
             load,
         };
@@ -794,7 +794,7 @@ impl Endpoint {
         let inbound = Inbound {
             incarnation,
             home: from.home(),
-            dialled: peer.dialled.clone(),
+            dialed: peer.dialed.clone(),
             load,
         };
         let this = Peer {
@@ -802,8 +802,8 @@ impl Endpoint {
             proved,
             home: from.home(),
             // Without a key, an accepted connection counts as one, whatever its hello says.
-            dialled: (!peer.dialled.is_empty() || proved.is_none() && link.was_accepted())
-                .then(|| (peer.dialled.clone(), peer.serial)),
+            dialed: (!peer.dialed.is_empty() || proved.is_none() && link.was_accepted())
+                .then(|| (peer.dialed.clone(), peer.serial)),
             load,
             listening: peer.listening.clone(),
         };
@@ -822,9 +822,9 @@ impl Endpoint {
                 if asked.is_empty() {
                     affected.superseded.extend(gone);
                     self.admit(&mut registry, link, &this, &affected.superseded, from)?;
-                    count(match this.dialled {
+                    count(match this.dialed {
                         Some(_) => &self.tally.accepted,
-                        None => &self.tally.dialled,
+                        None => &self.tally.dialed,
                     });
                     registry.note(link, this, inbound)?;
                     count(&self.tally.connections);
@@ -873,10 +873,10 @@ impl Endpoint {
         })
     }
 
-    /// Whether the peer dialled this service, according to its hello. If not, it dialled an address
+    /// Whether the peer dialed this service, according to its hello. If not, it dialed an address
     /// that another incarnation used before.
     fn is_sought_by(&self, peer: &Hello) -> bool {
-        let sought = peer.dialled.parse::<Location>().ok();
+        let sought = peer.dialed.parse::<Location>().ok();
         let sought = sought.map_or(Incarnation::UNKNOWN, |location| location.incarnation());
         !sought.is_known() || sought == self.config.identity.incarnation
     }
@@ -961,8 +961,8 @@ impl Endpoint {
     /// so without delay, for a pause that grows with each failure.
     pub(crate) fn has_detour(&self, link: &Arc<Link>) -> bool {
         let mut registry = self.registry.lock();
-        let mut dialled = registry.large.dialled.iter();
-        let Some((to, _)) = dialled.find(|(_, it)| Arc::ptr_eq(it, link)) else {
+        let mut dialed = registry.large.dialed.iter();
+        let Some((to, _)) = dialed.find(|(_, it)| Arc::ptr_eq(it, link)) else {
             return false;
         };
         let to = to.clone();
@@ -991,7 +991,7 @@ impl Endpoint {
         let mut was_known = false;
         for load in [Load::Any, Load::Large] {
             let connections = registry.of_mut(load);
-            connections.dialled.retain(|_, other| is_other(other));
+            connections.dialed.retain(|_, other| is_other(other));
             connections.known.retain(|_, links| {
                 let before = links.len();
                 links.retain(is_other);
@@ -1064,7 +1064,7 @@ impl Endpoint {
 impl Connections {
     /// Returns the connections that lead to a location, the one opened for it first.
     fn open(&self, to: &Location) -> impl Iterator<Item = &Arc<Link>> {
-        self.dialled.get(to).into_iter().chain(self.known_of(to))
+        self.dialed.get(to).into_iter().chain(self.known_of(to))
     }
 
     fn known_of(&self, to: &Location) -> impl Iterator<Item = &Arc<Link>> {
@@ -1159,7 +1159,7 @@ impl Registry {
         peer: Peer,
         inbound: Inbound,
     ) -> Result<(), ConnectionEnd> {
-        if let Some((_, serial)) = &peer.dialled {
+        if let Some((_, serial)) = &peer.dialed {
             match self.inbound.get(&inbound) {
                 Some((later, _)) if later > serial => return Err(ConnectionEnd::Superseded),
                 _ => self.inbound.insert(inbound, (*serial, link.clone())),

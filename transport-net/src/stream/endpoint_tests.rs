@@ -66,7 +66,7 @@ fn certificate(number: u8) -> Option<Principal> {
 struct Greeting {
     incarnation: u64,
     serial: u64,
-    dialled: &'static str,
+    dialed: &'static str,
     proved: Option<Principal>,
     from: Source,
     listening: &'static [&'static str],
@@ -77,7 +77,7 @@ fn greeting(incarnation: u64, proved: Option<Principal>, from: &str) -> Greeting
     Greeting {
         incarnation,
         serial: 1,
-        dialled: "tcp://10.0.0.1:7788",
+        dialed: "tcp://10.0.0.1:7788",
         proved,
         from: at(from),
         listening: &[],
@@ -95,7 +95,7 @@ async fn enters(
         max_letter: 1 << 20,
         max_in_flight: 8,
         serial: greeting.serial,
-        dialled: greeting.dialled.into(),
+        dialed: greeting.dialed.into(),
         listening: greeting.listening.iter().map(|it| (*it).into()).collect(),
         load: greeting.load,
     };
@@ -160,17 +160,17 @@ async fn unproved_connections_of_one_source_evict_each_other() {
     drop(registry);
 }
 
-/// A certificate or none, an incarnation, an origin, the serial number, and the dialled location.
+/// A certificate or none, an incarnation, an origin, the serial number, and the dialed location.
 fn comes(
     proved: Option<Principal>,
     incarnation: u64,
     from: &str,
     serial: u64,
-    dialled: &'static str,
+    dialed: &'static str,
 ) -> Greeting {
     Greeting {
         serial,
-        dialled,
+        dialed,
         ..greeting(incarnation, proved, from)
     }
 }
@@ -245,10 +245,10 @@ async fn a_peer_without_keys_is_admitted_at_each_address_that_its_first_connecti
     };
     let (first, _) = enters(&endpoint, first).await.unwrap();
     tokio::spawn(ends_when_asked_to(first.clone()));
-    for dialled in [X, Y] {
-        let second = comes(None, 7, "10.0.1.7:1", 2, dialled);
+    for dialed in [X, Y] {
+        let second = comes(None, 7, "10.0.1.7:1", 2, dialed);
         enters(&endpoint, second).await.unwrap();
-        assert_eq!(first.ending(), None, "both stay: {dialled}");
+        assert_eq!(first.ending(), None, "both stay: {dialed}");
     }
     // An unproved peer cannot list its own address: the connected peer must list it. The peer of
     // the first connection has no socket here and does not respond.
@@ -318,13 +318,13 @@ async fn a_peer_that_dials_an_earlier_incarnation_keeps_its_connection_with_this
 #[tokio::test]
 async fn an_unproved_peer_elsewhere_is_refused_beside_a_service_that_is_alive() {
     for load in [Load::Any, Load::Large] {
-        for (serial, dialled) in [(2, X), (2, Y), (0, X), (0, ""), (2, "")] {
+        for (serial, dialed) in [(2, X), (2, Y), (0, X), (0, ""), (2, "")] {
             let endpoint = endpoint(Limits::default());
             let honest = comes(None, 7, "10.0.0.7:1", 1, X);
             let (honest, _) = enters(&endpoint, honest).await.unwrap();
             let thief = Greeting {
                 load,
-                ..comes(None, 7, "10.0.0.9:1", serial, dialled)
+                ..comes(None, 7, "10.0.0.9:1", serial, dialed)
             };
             let answers = async {
                 loop {
@@ -337,7 +337,7 @@ async fn an_unproved_peer_elsewhere_is_refused_beside_a_service_that_is_alive() 
                 () = answers => unreachable!("it does not end"),
             };
             let refused = matches!(entered, Err(ConnectionEnd::IdentityConflict(_)));
-            assert!(refused, "{load:?}, {serial}, {dialled}");
+            assert!(refused, "{load:?}, {serial}, {dialed}");
             let to = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
             let route = endpoint.route_to(&to, load).unwrap();
             assert_eq!(matches!(route, Route::New(..)), load == Load::Large);
@@ -345,7 +345,7 @@ async fn an_unproved_peer_elsewhere_is_refused_beside_a_service_that_is_alive() 
     }
 }
 
-/// A link that was dialled for this location and whose peer has introduced itself.
+/// A link that was dialed for this location and whose peer has introduced itself.
 async fn dials(endpoint: &Endpoint, to: &Location) -> Arc<Link> {
     let Route::New(link, _) = endpoint.route_to(to, Load::Any).unwrap() else {
         panic!("there is a connection already");
@@ -362,7 +362,7 @@ fn greets(link: &Link, peer: u64) {
         max_letter: 1 << 20,
         max_in_flight: 8,
         serial: 0,
-        dialled: String::new(),
+        dialed: String::new(),
         listening: Vec::new(),
         load: Load::Any,
     });
@@ -403,7 +403,7 @@ impl<'a> Dispatcher<'a> {
         }
     }
 
-    /// Returns the place of the link among the dialled ones.
+    /// Returns the place of the link among the dialed ones.
     fn dispatch(&mut self, parcel: &Parcel) -> usize {
         self.attempts += 1;
         let attempt = AttemptId(self.attempts);
@@ -548,13 +548,13 @@ async fn letters_take_another_connection_after_their_peer_has_announced_another_
     let endpoint = endpoint(Limits::default());
     let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
     let moved: Location = "tcp://10.0.0.8:7788#0000000000000007".parse().unwrap();
-    let dialled = dials(&endpoint, &to).await;
+    let dialed = dials(&endpoint, &to).await;
     let elsewhere = comes(None, 7, "10.0.0.9:1", 1, Y);
     let (elsewhere, _) = enters(&endpoint, elsewhere).await.unwrap();
     let came = comes(None, 8, "10.0.0.7:1", 1, X);
     let (other_peer, _) = enters(&endpoint, came).await.unwrap();
     endpoint.service_left(&to);
-    assert!(dialled.is_suspect());
+    assert!(dialed.is_suspect());
     assert!(!elsewhere.is_suspect());
     assert!(!other_peer.is_suspect());
     endpoint.service_left(&"tcp://10.0.0.9:7788#0000000000000007".parse().unwrap());

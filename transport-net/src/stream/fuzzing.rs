@@ -62,7 +62,7 @@ fn hello(incarnation: u64) -> Hello {
         max_letter: MAX_LETTER as u64,
         max_in_flight: MAX_IN_FLIGHT as u32,
         serial: 1,
-        dialled: String::new(),
+        dialed: String::new(),
         listening: vec!["192.0.2.1:7788".into()],
         load: Load::Any,
     }

@@ -500,8 +500,8 @@ pub(crate) struct LinkTask {
     endpoint: Arc<Endpoint>,
     link: Arc<Link>,
     sink: Arc<dyn Sink>,
-    /// The location that this side dialled, if it opened the connection.
-    dialled: Option<Location>,
+    /// The location that this side dialed, if it opened the connection.
+    dialed: Option<Location>,
     /// The introduction of the peer, after its hello.
     peer: Option<Introduction>,
     /// The rate limit of the peer, if it has one.
@@ -518,14 +518,14 @@ impl LinkTask {
         endpoint: Arc<Endpoint>,
         link: Arc<Link>,
         sink: Arc<dyn Sink>,
-        dialled: Option<Location>,
+        dialed: Option<Location>,
     ) -> Self {
         link.begun.store(true, Ordering::Release);
         Self {
             endpoint,
             link,
             sink,
-            dialled,
+            dialed,
             peer: None,
             rate_limit: None,
             paused: None,
@@ -596,7 +596,7 @@ impl LinkTask {
         };
         if let ConnectionEnd::OtherVersion { .. } = self.end {
             self.endpoint
-                .other_version(from, self.dialled.as_ref(), &self.end);
+                .other_version(from, self.dialed.as_ref(), &self.end);
         }
         if self.end == ConnectionEnd::Silent {
             writer.discard();
@@ -866,7 +866,7 @@ impl LinkTask {
                     let introduction = Introduction {
                         name: peer.identity.name.into(),
                         hop,
-                        dialled: self.dialled.clone(),
+                        dialed: self.dialed.clone(),
                         mandate,
                     };
                     if !self.sink.accepts(&introduction) {
@@ -876,7 +876,7 @@ impl LinkTask {
                     }
                     let service = introduction.hop.location.incarnation();
                     let refused_dials = &self.endpoint.config.refused_dials;
-                    refused_dials.connected(self.dialled.as_ref(), service);
+                    refused_dials.connected(self.dialed.as_ref(), service);
                     self.peer = Some(introduction);
                 }
                 self.link.state.lock().connection.welcome();
@@ -933,7 +933,7 @@ impl Drop for LinkTask {
             let acquaintance = state.connection.acquaintance();
             (acquaintance, state.connection.end(&self.end))
         };
-        if let (Some(to), None) = (&self.dialled, &self.peer)
+        if let (Some(to), None) = (&self.dialed, &self.peer)
             && let Some(refusal) = self.end.refusal(acquaintance)
         {
             self.endpoint.config.refused_dials.add(to, &refusal.detail);

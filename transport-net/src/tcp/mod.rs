@@ -141,8 +141,8 @@ impl Transport for TcpTransport {
             return self.dispatch_legacy(attempt, to, parcel);
         }
         self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
-            let dialling = dial::dial(self.endpoint.clone(), link, sink, to.clone());
-            self.endpoint.runtime.spawn(dialling)
+            let dialing = dial::dial(self.endpoint.clone(), link, sink, to.clone());
+            self.endpoint.runtime.spawn(dialing)
         })
     }
 

@@ -21,7 +21,7 @@ use fipa_transport::{
 
 use super::config::UdpLimits;
 use super::counters::UdpCounters;
-use super::dialling::{Dialling, OwnHello};
+use super::dialing::{Dialing, OwnHello};
 use super::mtu::Mtu;
 use super::packet::{self, BASE, DATA_LEN, MAX_ACK, PARCEL_OVERHEAD};
 use super::received::Received;
@@ -71,7 +71,7 @@ pub(crate) struct Connection {
     expected: Incarnation,
     peer: Option<Hello>,
     /// The handshake, until the peer has answered.
-    dialling: Option<Dialling>,
+    dialing: Option<Dialing>,
     path: Option<Path>,
     waiting: VecDeque<Outgoing>,
     waiting_bytes: usize,
@@ -138,17 +138,17 @@ struct Sent {
 impl Connection {
     /// Creates a connection that this side opens, with the expected incarnation, which may be
     /// unknown.
-    pub(crate) fn dialling(
+    pub(crate) fn dialing(
         limits: UdpLimits,
         id: u64,
         expected: Incarnation,
         hello: Hello,
         now: Instant,
     ) -> Self {
-        let dialling = Dialling::new(OwnHello { id, hello }, now + limits.connect_timeout);
+        let dialing = Dialing::new(OwnHello { id, hello }, now + limits.connect_timeout);
         Self {
             expected,
-            dialling: Some(dialling),
+            dialing: Some(dialing),
             ..Self::new(limits, id, now)
         }
     }
@@ -185,7 +185,7 @@ impl Connection {
             peer_id: 0,
             expected: Incarnation::UNKNOWN,
             peer: None,
-            dialling: None,
+            dialing: None,
             path: None,
             waiting: VecDeque::new(),
             waiting_bytes: 0,
@@ -236,12 +236,12 @@ impl Connection {
 
     /// Whether the peer has not answered the hello yet.
     pub(crate) fn is_opening(&self) -> bool {
-        self.dialling.is_some()
+        self.dialing.is_some()
     }
 
     /// Returns the handshake while it is not complete.
-    pub(crate) fn dialling_mut(&mut self) -> Option<&mut Dialling> {
-        self.dialling.as_mut()
+    pub(crate) fn dialing_mut(&mut self) -> Option<&mut Dialing> {
+        self.dialing.as_mut()
     }
 
     /// Queues a parcel for sending.
@@ -341,12 +341,12 @@ impl Connection {
         peer: Hello,
         now: Instant,
     ) -> Result<(), ConnectionEnd> {
-        let Some(dialling) = self.dialling.take() else {
+        let Some(dialing) = self.dialing.take() else {
             return Ok(());
         };
         self.path = Some(path);
         self.peer_id = peer_id;
-        if let Some(sample) = dialling.round_trip(path, now) {
+        if let Some(sample) = dialing.round_trip(path, now) {
             self.recovery.measured(sample);
         }
         self.heard = Some(now);
@@ -463,8 +463,8 @@ impl Connection {
         now: Instant,
         counters: &mut UdpCounters,
     ) -> Option<Outbound> {
-        if let Some(dialling) = &mut self.dialling {
-            return dialling.poll_transmit(now);
+        if let Some(dialing) = &mut self.dialing {
+            return dialing.poll_transmit(now);
         }
         let path = self.path?;
         self.drop_unsendable();
@@ -525,8 +525,8 @@ impl Connection {
     /// Returns the time at which [`handle_timeout`](Self::handle_timeout) must be called at the
     /// latest.
     pub(crate) fn poll_timeout(&self) -> Option<Instant> {
-        if let Some(dialling) = &self.dialling {
-            return Some(dialling.due());
+        if let Some(dialing) = &self.dialing {
+            return Some(dialing.due());
         }
         let silent = self
             .recovery
@@ -551,8 +551,8 @@ impl Connection {
     /// # Errors
     /// When the connection is over.
     pub(crate) fn handle_timeout(&mut self, now: Instant) -> Result<(), ConnectionEnd> {
-        if let Some(dialling) = &mut self.dialling {
-            return dialling.handle_timeout(now, self.limits.connect_timeout);
+        if let Some(dialing) = &mut self.dialing {
+            return dialing.handle_timeout(now, self.limits.connect_timeout);
         }
         if let Some((since, tries)) = self.recovery.waiting_since()
             && tries >= MIN_TRIES

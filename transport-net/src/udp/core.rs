@@ -64,10 +64,10 @@ pub(crate) struct Core {
     /// Connections by the identifier that peers put on their datagrams.
     ids: HashMap<u64, u32>,
     /// Connections opened by this side, by location.
-    dialled: HashMap<Location, u32>,
+    dialed: HashMap<Location, u32>,
     /// The connections with the service of an incarnation, in the order of introduction.
     known: HashMap<Incarnation, Vec<u32>>,
-    /// The latest connection of each peer for each location that the peer dialled, with the peer's
+    /// The latest connection of each peer for each location that the peer dialed, with the peer's
     /// serial number.
     inbound: HashMap<Inbound, (u64, u32)>,
     /// Accepted connections by the source address and the initiator number of their hello.
@@ -85,8 +85,8 @@ pub(crate) struct Core {
 
 struct Entry {
     connection: Connection,
-    /// The location that this side dialled, if it opened the connection.
-    dialled: Option<Location>,
+    /// The location that this side dialed, if it opened the connection.
+    dialed: Option<Location>,
     /// The introduction of the peer, after its hello.
     peer: Option<Introduction>,
     /// The source address and initiator number of the hello, if the peer opened the connection.
@@ -115,7 +115,7 @@ impl Scheduled for Entry {
 struct Inbound {
     incarnation: Incarnation,
     ip: IpAddr,
-    dialled: String,
+    dialed: String,
 }
 
 impl Core {
@@ -135,7 +135,7 @@ impl Core {
             random,
             connections: Connections::new(),
             ids: HashMap::new(),
-            dialled: HashMap::new(),
+            dialed: HashMap::new(),
             known: HashMap::new(),
             inbound: HashMap::new(),
             greeted: HashMap::new(),
@@ -174,9 +174,9 @@ impl Core {
         to: &Location,
         parcel: &Parcel,
     ) -> Result<Option<u32>, TransportError> {
-        let dialled = self.dialled.get(to).copied();
+        let dialed = self.dialed.get(to).copied();
         let known = self.known.get(&to.incarnation());
-        let there = dialled.or_else(|| known.and_then(|numbers| numbers.first().copied()));
+        let there = dialed.or_else(|| known.and_then(|numbers| numbers.first().copied()));
         let (number, fresh) = match there {
             Some(number) => (number, false),
             None => (self.create(now, to)?, true),
@@ -187,7 +187,7 @@ impl Core {
                 "the connection has ended",
             ));
         };
-        if dialled.is_none() && !fresh {
+        if dialed.is_none() && !fresh {
             entry.connection.is_used_for(now, to);
         }
         if let Err(error) = entry.connection.send(attempt, parcel) {
@@ -240,8 +240,8 @@ impl Core {
     /// Sets the paths to the peer of a new connection.
     pub(crate) fn begin(&mut self, now: Instant, number: u32, paths: Vec<Path>) {
         self.with(number, |connection, _| {
-            if let Some(dialling) = connection.dialling_mut() {
-                dialling.begin(paths, now);
+            if let Some(dialing) = connection.dialing_mut() {
+                dialing.begin(paths, now);
             }
             Ok(())
         });
@@ -256,9 +256,9 @@ impl Core {
     pub(crate) fn abandon(&mut self, attempt: AttemptId, to: &Location) -> Abandoned {
         self.notes
             .retain(|told| !matches!(told, CoreEvent::Concluded(other, _) if *other == attempt));
-        let dialled = self.dialled.get(to).into_iter();
+        let dialed = self.dialed.get(to).into_iter();
         let known = self.known.get(&to.incarnation()).into_iter().flatten();
-        for number in dialled.chain(known) {
+        for number in dialed.chain(known) {
             let Some(entry) = self.connections.get_mut(*number) else {
                 continue;
             };
@@ -299,9 +299,9 @@ impl Core {
                 hello,
             } if listening => self.greet(now, path, initiator, &cookie, hello),
             Datagram::Cookie { to, cookie } => {
-                self.of_dialling(to, path, |_, connection| {
-                    if let Some(dialling) = connection.dialling_mut() {
-                        dialling.handle_cookie(path, cookie, now);
+                self.of_dialing(to, path, |_, connection| {
+                    if let Some(dialing) = connection.dialing_mut() {
+                        dialing.handle_cookie(path, cookie, now);
                     }
                     Ok(())
                 });
@@ -312,7 +312,7 @@ impl Core {
                 hello,
             } => self.welcome(now, path, to, acceptor, hello),
             Datagram::Refused { to } => {
-                self.of_dialling(to, path, |_, _| {
+                self.of_dialing(to, path, |_, _| {
                     let detail = "the peer refused the connection: its max_connections is reached, or it is connected \
                                   with this service already";
                     Err(ConnectionEnd::NotOpened(TransportError::new(TransportErrorKind::Refused, detail)))
@@ -346,8 +346,8 @@ impl Core {
 
     /// Handles an error of the operating system on a path.
     pub(crate) fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str) {
-        self.with(number, |connection, _| match connection.dialling_mut() {
-            Some(dialling) => dialling.failed(path, what, now),
+        self.with(number, |connection, _| match connection.dialing_mut() {
+            Some(dialing) => dialing.failed(path, what, now),
             None => Err(ConnectionEnd::Broken(what.to_owned())),
         });
     }
@@ -435,9 +435,9 @@ impl Core {
         let hello = self.own_hello(self.last_serial, format!("{:016x}", hasher.finish()));
         let id = self.fresh_id();
         let limits = self.limits.clone();
-        let connection = Connection::dialling(limits, id, to.incarnation(), hello, now);
+        let connection = Connection::dialing(limits, id, to.incarnation(), hello, now);
         let number = self.insert(connection, Some(to.clone()), None);
-        self.dialled.insert(to.clone(), number);
+        self.dialed.insert(to.clone(), number);
         Ok(number)
     }
 
@@ -485,13 +485,13 @@ impl Core {
     fn insert(
         &mut self,
         connection: Connection,
-        dialled: Option<Location>,
+        dialed: Option<Location>,
         greeted: Option<(SocketAddr, u64)>,
     ) -> u32 {
         let id = connection.id();
         let number = self.connections.insert(Entry {
             connection,
-            dialled,
+            dialed,
             peer: None,
             greeted,
             asked: None,
@@ -508,7 +508,7 @@ impl Core {
             let peer = Introduction {
                 name,
                 hop,
-                dialled: entry.dialled.clone(),
+                dialed: entry.dialed.clone(),
                 mandate: Mandate::Unproved,
             };
             self.notes.push_back(CoreEvent::Introduced(peer.clone()));
@@ -539,7 +539,7 @@ impl Core {
     fn remove(&mut self, number: u32) -> Option<Entry> {
         let entry = self.connections.remove(number)?;
         self.ids.remove(&entry.connection.id());
-        self.dialled.retain(|_, other| *other != number);
+        self.dialed.retain(|_, other| *other != number);
         self.inbound.retain(|_, (_, other)| *other != number);
         if let Some(greeted) = entry.greeted {
             self.greeted.remove(&greeted);

@@ -9,7 +9,7 @@ pub struct UdpCounters {
     /// Connections that are open now and whose peer has introduced itself.
     pub connections: u64,
     /// Connections opened by this side whose peer has introduced itself.
-    pub dialled: u64,
+    pub dialed: u64,
     /// Connections opened by peers that introduced themselves.
     pub accepted: u64,
     /// Connections that could not be opened.

@@ -99,7 +99,7 @@ fn hello(service: u64, serial: u64) -> Hello {
         max_letter: 60_000,
         max_in_flight: 100,
         serial,
-        dialled: "0123456789abcdef".into(),
+        dialed: "0123456789abcdef".into(),
         listening: vec![address(0).to_string()],
         load: Load::Any,
     }

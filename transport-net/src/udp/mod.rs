@@ -2,7 +2,7 @@
 //!
 //! * [`packet`]: the encoding.
 //! * [`core`]: the protocol without sockets and clock, with the [`connection`]s in it. A connection
-//!   is [`dialling`] at first; then it has [`received`], [`recovery`] and the [`mtu`] of its path.
+//!   is [`dialing`] at first; then it has [`received`], [`recovery`] and the [`mtu`] of its path.
 //! * [`endpoint`]: the core as a [`Protocol`](crate::datagrams::Protocol). The tasks around it, with
 //!   their sockets, are in [`crate::datagrams`], which it shares with UDT.
 //!
@@ -18,7 +18,7 @@ mod config;
 mod connection;
 mod core;
 mod counters;
-mod dialling;
+mod dialing;
 mod endpoint;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;

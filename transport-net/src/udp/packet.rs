@@ -403,7 +403,7 @@ mod tests {
             max_letter: 1000,
             max_in_flight: 10,
             serial: 1,
-            dialled: "0123456789abcdef".into(),
+            dialed: "0123456789abcdef".into(),
             listening: vec!["[fe80::1234:5678:9abc:def0%12]:65535".into(); listening],
             load: Default::default(),
         }

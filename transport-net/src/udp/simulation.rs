@@ -466,7 +466,7 @@ fn unproved_peers_leave_no_state_and_get_fewer_bytes_than_they_sent() {
         max_letter: 1000,
         max_in_flight: 10,
         serial: 1,
-        dialled: "x".into(),
+        dialed: "x".into(),
         listening: Vec::new(),
         load: crate::hello::Load::Any,
     };
@@ -554,7 +554,7 @@ fn connections_of_one_address_are_bounded() {
             max_letter: 1000,
             max_in_flight: 10,
             serial: 1,
-            dialled: "x".into(),
+            dialed: "x".into(),
             listening: Vec::new(),
             load: crate::hello::Load::Any,
         };
@@ -632,10 +632,10 @@ struct UnprovedSlot {
 
 impl UnprovedSlot {
     /// A peer with the identity of B gets a cookie from A.
-    fn as_b(simulation: &mut Simulation, from: &str, dialled: &str) -> Self {
+    fn as_b(simulation: &mut Simulation, from: &str, dialed: &str) -> Self {
         let hello = crate::hello::Hello {
             serial: 1 << 60,
-            dialled: dialled.into(),
+            dialed: dialed.into(),
             ..simulation.cores[B].own_hello(0, String::new())
         };
         let from: SocketAddr = from.parse().unwrap();
@@ -713,11 +713,11 @@ fn an_unproved_peer_at_the_service_address_is_admitted_when_the_service_does_not
                     Some(Datagram::Hello { hello, .. }) => crate::hello::Hello::decode(hello),
                     _ => None,
                 });
-        let dialled = hello.unwrap().dialled;
+        let dialed = hello.unwrap().dialed;
         simulation.until_concluded(B, &BTreeSet::from([1]));
         assert_eq!(simulation.cores[A].counters().accepted, 1);
         simulation.cut = gone;
-        let stranger = UnprovedSlot::as_b(&mut simulation, "192.0.2.2:99", &dialled);
+        let stranger = UnprovedSlot::as_b(&mut simulation, "192.0.2.2:99", &dialed);
         stranger.greets(&mut simulation, Duration::from_secs(2));
         let after = simulation.cores[A].counters();
         assert_eq!(

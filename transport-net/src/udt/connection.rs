@@ -18,12 +18,12 @@ use super::packet::{
 };
 use super::receiver::{Arrived, Dropped, Receiver, WINDOW};
 use super::sender::Sender;
-use crate::datagrams::dialling::Greeting;
+use crate::datagrams::dialing::Greeting;
 use crate::datagrams::{Outbound, Path};
 use crate::end::ConnectionEnd;
 
 /// The handshake of a connection that this side opens.
-pub(crate) type Dialling = crate::datagrams::dialling::Dialling<OwnHandshake>;
+pub(crate) type Dialing = crate::datagrams::dialing::Dialing<OwnHandshake>;
 
 /// Time without a packet from the peer after which a keep-alive is sent, as libudt does.
 const KEEP_ALIVE: Duration = Duration::from_millis(300);
@@ -89,17 +89,17 @@ pub(crate) struct Connection {
 #[derive(Debug)]
 enum Role {
     /// This side opens the connection. Letters wait meanwhile.
-    Dialling(Dialling, Box<Sender>),
+    Dialing(Dialing, Box<Sender>),
     Sending(Box<Sender>),
     Receiving(Box<Receiver>),
 }
 
 impl Connection {
     /// Creates a connection that this side opens.
-    pub(crate) fn dialling(limits: UdtLimits, id: u32, initial: u32, now: Instant) -> Self {
-        let dialling = Dialling::new(OwnHandshake { id, initial }, now + limits.connect_timeout);
+    pub(crate) fn dialing(limits: UdtLimits, id: u32, initial: u32, now: Instant) -> Self {
+        let dialing = Dialing::new(OwnHandshake { id, initial }, now + limits.connect_timeout);
         let sender = Sender::new(limits.clone(), initial, now);
-        let role = Role::Dialling(dialling, Box::new(sender));
+        let role = Role::Dialing(dialing, Box::new(sender));
         Self::new(limits, (id, 0), initial, None, role, now)
     }
 
@@ -150,13 +150,13 @@ impl Connection {
 
     /// Whether the peer has not answered the handshake yet.
     pub(crate) fn is_opening(&self) -> bool {
-        matches!(self.role, Role::Dialling(..))
+        matches!(self.role, Role::Dialing(..))
     }
 
     /// Returns the handshake while it is not complete.
-    pub(crate) fn dialling_mut(&mut self) -> Option<&mut Dialling> {
+    pub(crate) fn dialing_mut(&mut self) -> Option<&mut Dialing> {
         match &mut self.role {
-            Role::Dialling(dialling, _) => Some(dialling),
+            Role::Dialing(dialing, _) => Some(dialing),
             _ => None,
         }
     }
@@ -164,7 +164,7 @@ impl Connection {
     /// Returns the sender, if this side opened the connection.
     pub(crate) fn sender(&self) -> Option<&Sender> {
         match &self.role {
-            Role::Dialling(_, sender) | Role::Sending(sender) => Some(sender),
+            Role::Dialing(_, sender) | Role::Sending(sender) => Some(sender),
             Role::Receiving(_) => None,
         }
     }
@@ -172,7 +172,7 @@ impl Connection {
     /// Returns the sender to change it, if this side opened the connection.
     pub(crate) fn sender_mut(&mut self) -> Option<&mut Sender> {
         match &mut self.role {
-            Role::Dialling(_, sender) | Role::Sending(sender) => Some(sender),
+            Role::Dialing(_, sender) | Role::Sending(sender) => Some(sender),
             Role::Receiving(_) => None,
         }
     }
@@ -187,7 +187,7 @@ impl Connection {
     /// Returns the time since which no part of a letter has been under way.
     pub(crate) fn idle_since(&self) -> Option<Instant> {
         let is_idle = match &self.role {
-            Role::Dialling(_, sender) | Role::Sending(sender) => sender.is_idle(),
+            Role::Dialing(_, sender) | Role::Sending(sender) => sender.is_idle(),
             Role::Receiving(receiver) => receiver.is_idle(),
         };
         is_idle.then_some(self.busy)
@@ -203,13 +203,13 @@ impl Connection {
         handshake: &Handshake,
         now: Instant,
     ) -> Result<(), ConnectionEnd> {
-        let Role::Dialling(dialling, _) = &mut self.role else {
+        let Role::Dialing(dialing, _) = &mut self.role else {
             // The answer to a handshake that was sent twice.
             return Ok(());
         };
         match handshake.request {
             REQUEST => {
-                dialling.handle_cookie(path, handshake.cookie, now);
+                dialing.handle_cookie(path, handshake.cookie, now);
                 return Ok(());
             }
             CONCLUSION => {}
@@ -339,7 +339,7 @@ impl Connection {
 
     pub(crate) fn has_events(&self) -> bool {
         match &self.role {
-            Role::Dialling(_, sender) | Role::Sending(sender) => sender.has_concluded(),
+            Role::Dialing(_, sender) | Role::Sending(sender) => sender.has_concluded(),
             Role::Receiving(receiver) => receiver.has_arrived(),
         }
     }
@@ -350,8 +350,8 @@ impl Connection {
         now: Instant,
         counters: &mut UdtCounters,
     ) -> Option<(Path, Vec<u8>, Option<usize>)> {
-        if let Role::Dialling(dialling, _) = &mut self.role {
-            let (path, contents) = dialling.poll_transmit(now)?;
+        if let Role::Dialing(dialing, _) = &mut self.role {
+            let (path, contents) = dialing.poll_transmit(now)?;
             return Some((path, contents, None));
         }
         let (path, to, time) = (self.path?, self.peer_id, self.time(now));
@@ -360,7 +360,7 @@ impl Connection {
             return Some((path, packet::control(&reply, time, to), None));
         }
         let polled = match &mut self.role {
-            Role::Dialling(..) => None,
+            Role::Dialing(..) => None,
             Role::Sending(sender) => {
                 let full = sender.full();
                 let mut contents = Vec::with_capacity(full);
@@ -395,7 +395,7 @@ impl Connection {
     /// Returns the time at which something is to be sent or checked.
     pub(crate) fn poll_timeout(&self) -> Option<Instant> {
         let role = match &self.role {
-            Role::Dialling(dialling, _) => return Some(dialling.due()),
+            Role::Dialing(dialing, _) => return Some(dialing.due()),
             Role::Sending(sender) => sender.poll_timeout(),
             Role::Receiving(receiver) => receiver.poll_timeout(),
         };
@@ -414,8 +414,8 @@ impl Connection {
     /// When the connection ends for that reason.
     pub(crate) fn handle_timeout(&mut self, now: Instant) -> Result<(), ConnectionEnd> {
         match &mut self.role {
-            Role::Dialling(dialling, _) => {
-                return dialling.handle_timeout(now, self.limits.connect_timeout);
+            Role::Dialing(dialing, _) => {
+                return dialing.handle_timeout(now, self.limits.connect_timeout);
             }
             Role::Sending(sender) => {
                 if sender.is_stalled(now) {
@@ -457,7 +457,7 @@ impl Connection {
             }
         };
         let concluded = match self.role {
-            Role::Dialling(_, sender) | Role::Sending(sender) => sender.end(&end.after()).collect(),
+            Role::Dialing(_, sender) | Role::Sending(sender) => sender.end(&end.after()).collect(),
             Role::Receiving(_) => Vec::new(),
         };
         (concluded, shutdown)

@@ -66,7 +66,7 @@ pub(crate) struct Core {
     /// Connections by the number of their socket.
     sockets: HashMap<u32, u32>,
     /// Connections opened by this side, by location.
-    dialled: HashMap<Location, u32>,
+    dialed: HashMap<Location, u32>,
     /// Connections opened by peers, by their origin.
     accepted: HashMap<Origin, u32>,
     /// Letters that no connection has yet.
@@ -84,7 +84,7 @@ pub(crate) struct Core {
 struct Entry {
     connection: Connection,
     /// The location, if this side opened the connection.
-    dialled: Option<Location>,
+    dialed: Option<Location>,
     /// The origin, if the peer opened it.
     origin: Option<Origin>,
 }
@@ -121,7 +121,7 @@ impl Core {
             random,
             connections: Connections::new(),
             sockets: HashMap::new(),
-            dialled: HashMap::new(),
+            dialed: HashMap::new(),
             accepted: HashMap::new(),
             untranslated: Untranslated::default(),
             outbox: VecDeque::new(),
@@ -159,8 +159,8 @@ impl Core {
         letter: Letter,
     ) -> Result<bool, TransportError> {
         let waiting = self.untranslated.load(to);
-        let dialled = self.dialled.get(to);
-        let entry = dialled.and_then(|number| self.connections.get(*number));
+        let dialed = self.dialed.get(to);
+        let entry = dialed.and_then(|number| self.connections.get(*number));
         let load = match entry.and_then(|entry| entry.connection.sender()) {
             Some(sender) => {
                 let queued = sender.load();
@@ -213,7 +213,7 @@ impl Core {
         to: &Location,
         letter: [Bytes; 2],
     ) -> Result<Option<u32>, TransportError> {
-        let there = self.dialled.get(to).copied();
+        let there = self.dialed.get(to).copied();
         let number = match there {
             Some(number) => number,
             None => self.create(now, to)?,
@@ -237,7 +237,7 @@ impl Core {
     /// their translation.
     fn has_room_for_another_location(&self) -> bool {
         let waiting = self.untranslated.locations();
-        let needed = waiting.filter(|to| !self.dialled.contains_key(to)).count();
+        let needed = waiting.filter(|to| !self.dialed.contains_key(to)).count();
         self.connections.len() + needed < self.limits.max_connections
     }
 
@@ -276,8 +276,8 @@ impl Core {
             return self.end(now, number, &ConnectionEnd::NotOpened(error));
         }
         self.with(now, number, |connection, _| {
-            if let Some(dialling) = connection.dialling_mut() {
-                dialling.begin(paths, now);
+            if let Some(dialing) = connection.dialing_mut() {
+                dialing.begin(paths, now);
             }
             Ok(())
         });
@@ -301,7 +301,7 @@ impl Core {
                 _ => Abandoned::Unconfirmed,
             };
         }
-        let Some(number) = self.dialled.get(to) else {
+        let Some(number) = self.dialed.get(to) else {
             return Abandoned::Unconfirmed;
         };
         let entry = self.connections.get_mut(*number);
@@ -333,9 +333,9 @@ impl Core {
             self.counters.ignored += 1;
             return;
         };
-        let is_its = match (entry.connection.path(), entry.connection.dialling_mut()) {
+        let is_its = match (entry.connection.path(), entry.connection.dialing_mut()) {
             (Some(its), _) => its.remote == path.remote,
-            (None, Some(dialling)) => dialling.uses(path),
+            (None, Some(dialing)) => dialing.uses(path),
             (None, None) => false,
         };
         if !is_its {
@@ -346,7 +346,7 @@ impl Core {
             Packet::Control(Control::Handshake(handshake)) => {
                 let was_opening = connection.is_opening();
                 connection.handle_handshake(path, handshake, now)?;
-                counters.dialled += u64::from(was_opening && !connection.is_opening());
+                counters.dialed += u64::from(was_opening && !connection.is_opening());
                 Ok(())
             }
             _ if connection.is_opening() => {
@@ -364,8 +364,8 @@ impl Core {
     /// Handles an error of the operating system on a path.
     pub(crate) fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str) {
         self.with(now, number, |connection, _| {
-            match connection.dialling_mut() {
-                Some(dialling) => dialling.failed(path, what, now),
+            match connection.dialing_mut() {
+                Some(dialing) => dialing.failed(path, what, now),
                 None => Err(ConnectionEnd::Broken(what.to_owned())),
             }
         });
@@ -564,9 +564,9 @@ impl Core {
         }
         let id = self.fresh_socket();
         let initial = sequence::wire((self.random)());
-        let connection = Connection::dialling(self.limits.clone(), id, initial, now);
+        let connection = Connection::dialing(self.limits.clone(), id, initial, now);
         let number = self.insert(connection, Some(to.clone()), None);
-        self.dialled.insert(to.clone(), number);
+        self.dialed.insert(to.clone(), number);
         Ok(number)
     }
 
@@ -621,13 +621,13 @@ impl Core {
     fn insert(
         &mut self,
         connection: Connection,
-        dialled: Option<Location>,
+        dialed: Option<Location>,
         origin: Option<Origin>,
     ) -> u32 {
         let id = connection.id();
         let number = self.connections.insert(Entry {
             connection,
-            dialled,
+            dialed,
             origin,
         });
         self.sockets.insert(id, number);
@@ -639,8 +639,8 @@ impl Core {
     fn remove(&mut self, number: u32) -> Option<Entry> {
         let entry = self.connections.remove(number)?;
         self.sockets.remove(&entry.connection.id());
-        if let Some(location) = &entry.dialled {
-            self.dialled.remove(location);
+        if let Some(location) = &entry.dialed {
+            self.dialed.remove(location);
         }
         if let Some(origin) = &entry.origin {
             self.accepted.remove(origin);

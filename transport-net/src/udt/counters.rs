@@ -9,7 +9,7 @@ pub struct UdtCounters {
     /// Connections that are open now.
     pub connections: u64,
     /// Connections opened by this side.
-    pub dialled: u64,
+    pub dialed: u64,
     /// Connections opened by peers.
     pub accepted: u64,
     /// Connections that could not be opened.

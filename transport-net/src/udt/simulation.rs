@@ -388,7 +388,7 @@ fn every_letter_is_handed_over_once_and_in_order() {
         let simulation = run(seed, FAIR);
         for core in &simulation.cores {
             let counters = core.counters();
-            assert_eq!((counters.dialled, counters.accepted), (1, 1));
+            assert_eq!((counters.dialed, counters.accepted), (1, 1));
         }
     });
 }
@@ -798,7 +798,7 @@ fn connections_of_one_address_are_bounded_and_idle_ones_make_room() {
 }
 
 #[test]
-fn peers_without_access_are_neither_answered_nor_dialled() {
+fn peers_without_access_are_neither_answered_nor_dialed() {
     let now = Instant::now();
     let mut simulation = Simulation::new(1, FAIR, &UdtLimits::default());
     let access = Box::new(|ip| ip == address(A).ip());

@@ -246,8 +246,8 @@ impl Transport for UnixTransport {
         self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
             let bound = self.bound.lock();
             let directory = bound.as_ref().map(|it| it.directory.clone());
-            let dialling = dial::dial(self.endpoint.clone(), directory, link, sink, to.clone());
-            self.endpoint.runtime.spawn(dialling)
+            let dialing = dial::dial(self.endpoint.clone(), directory, link, sink, to.clone());
+            self.endpoint.runtime.spawn(dialing)
         })
     }
 

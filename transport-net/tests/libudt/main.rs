@@ -311,7 +311,7 @@ fn assert_exchanged(program: &Path, contents: &[Vec<u8>]) {
     let counters = party.transport.counters();
     let count = contents.len() as u64;
     assert_eq!((counters.letters_out, counters.letters_in), (count, count));
-    assert_eq!((counters.dialled, counters.accepted), (1, 1));
+    assert_eq!((counters.dialed, counters.accepted), (1, 1));
     assert_eq!(counters.refused_nonsense, 0);
 }
 

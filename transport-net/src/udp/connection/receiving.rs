@@ -23,7 +23,7 @@ impl Connection {
         now: Instant,
         counters: &mut UdpCounters,
     ) -> Result<(), ConnectionEnd> {
-        if self.dialling.is_some() {
+        if self.dialing.is_some() {
             // The welcome is late or lost; the peer retransmits these frames.
             return Ok(());
         }

@@ -67,7 +67,7 @@ impl Core {
         let inbound = Inbound {
             incarnation: peer.identity.incarnation,
             ip: from.ip(),
-            dialled: peer.dialled.clone(),
+            dialed: peer.dialed.clone(),
         };
         let before = self.inbound.get(&inbound);
         if before.is_some_and(|(serial, _)| *serial > peer.serial) {
@@ -198,7 +198,7 @@ impl Core {
         let rate_limit = self.rate_limit(path.remote.ip(), now);
         let meter = self.meter(path.remote.ip());
         let (own, mut greeted) = (self.identity.incarnation, None);
-        self.of_dialling(to, path, |number, connection| {
+        self.of_dialing(to, path, |number, connection| {
             if peer.identity.incarnation == own {
                 return Err(ConnectionEnd::Itself);
             }
@@ -210,7 +210,7 @@ impl Core {
             Ok(())
         });
         if let (Some((number, name)), Some(hop)) = (greeted, hop) {
-            self.counters.dialled += 1;
+            self.counters.dialed += 1;
             self.enter(now, number, name, hop);
         }
     }
@@ -238,7 +238,7 @@ impl Core {
     }
 
     /// Calls `act` with the connection that is being opened over this path.
-    pub(super) fn of_dialling(
+    pub(super) fn of_dialing(
         &mut self,
         to: u64,
         path: Path,
@@ -247,8 +247,8 @@ impl Core {
         let number = self.ids.get(&to).copied();
         let entry = number.and_then(|number| self.connections.get_mut(number));
         let meant = entry
-            .and_then(|entry| entry.connection.dialling_mut())
-            .is_some_and(|dialling| dialling.uses(path));
+            .and_then(|entry| entry.connection.dialing_mut())
+            .is_some_and(|dialing| dialing.uses(path));
         match number.filter(|_| meant) {
             Some(number) => self.with(number, |connection, _| act(number, connection)),
             None => self.counters.ignored += 1,
@@ -264,13 +264,13 @@ impl Core {
         })
     }
 
-    pub(in crate::udp) fn own_hello(&self, serial: u64, dialled: String) -> Hello {
+    pub(in crate::udp) fn own_hello(&self, serial: u64, dialed: String) -> Hello {
         Hello {
             identity: self.identity.clone(),
             max_letter: self.limits.max_datagram as u64,
             max_in_flight: u32::try_from(self.limits.max_in_flight.max(1)).unwrap_or(u32::MAX),
             serial,
-            dialled,
+            dialed,
             listening: self.listening.clone(),
             load: Load::Any,
         }

@@ -26,7 +26,7 @@ use crate::routes::{Connected, LinkSecurity};
 
 /// The gateways with an open connection. The number of connections bounds their number.
 #[derive(Debug, Default)]
-pub(crate) struct Neighbours {
+pub(crate) struct Neighbors {
     state: Mutex<State>,
     /// Number of changes of the neighbors' entries.
     generation: AtomicU64,
@@ -35,7 +35,7 @@ pub(crate) struct Neighbours {
 
 #[derive(Debug, Default)]
 struct State {
-    present: HashMap<Incarnation, Neighbour>,
+    present: HashMap<Incarnation, Neighbor>,
     peers: Vec<Peer>,
     /// Locations at which an attempt failed, and the cause.
     doubted: HashMap<Location, TransportErrorKind>,
@@ -60,7 +60,7 @@ const MAX_DOUBTED: usize = 64;
 /// A gateway of another host with which a connection is open.
 #[derive(Debug, Clone)]
 #[non_exhaustive]
-pub struct Neighbour {
+pub struct Neighbor {
     /// The directory entry of the gateway; its time of registration is that of the first
     /// connection. Its locations are also those of the agents of the gateway.
     pub entry: Arc<Entry>,
@@ -81,17 +81,17 @@ pub struct Neighbour {
     pub peer: Option<Arc<str>>,
 }
 
-impl From<Neighbour> for Connected {
-    fn from(neighbour: Neighbour) -> Self {
-        let entry = neighbour.entry;
+impl From<Neighbor> for Connected {
+    fn from(neighbor: Neighbor) -> Self {
+        let entry = neighbor.entry;
         let since = SystemTime::now().duration_since(entry.registered);
         Self {
             name: entry.name.to_string(),
             incarnation: entry.incarnation,
             locations: entry.locations.clone(),
-            connections: neighbour.connections,
+            connections: neighbor.connections,
             seconds: since.unwrap_or_default().as_secs(),
-            security: security(neighbour.principal),
+            security: security(neighbor.principal),
         }
     }
 }
@@ -113,7 +113,7 @@ fn security(principal: Principal) -> LinkSecurity {
     }
 }
 
-impl Neighbours {
+impl Neighbors {
     /// Sets the name of this gateway. The first neighbor with the same name is reported.
     pub(super) fn name_own(&self, name: &str) {
         self.state.lock().own_name = Some(name.into());
@@ -127,8 +127,8 @@ impl Neighbours {
     /// Whether this gateway or a neighbor has the name.
     pub(super) fn has_gateway(&self, name: &str) -> bool {
         let state = self.state.lock();
-        let mut neighbours = state.present.values();
-        state.own_name.as_deref() == Some(name) || neighbours.any(|it| *it.entry.name == *name)
+        let mut neighbors = state.present.values();
+        state.own_name.as_deref() == Some(name) || neighbors.any(|it| *it.entry.name == *name)
     }
 
     /// Whether a neighbor with the name of this gateway was logged.
@@ -137,7 +137,7 @@ impl Neighbours {
     }
 
     /// Returns all neighbors, in no particular order.
-    pub(crate) fn all(&self) -> Vec<Neighbour> {
+    pub(crate) fn all(&self) -> Vec<Neighbor> {
         self.state.lock().present.values().cloned().collect()
     }
 
@@ -180,12 +180,12 @@ impl Neighbours {
             log_limit::info!(of: source(at), %name, %at, "ignored a connection with another certificate");
             return;
         }
-        let neighbour = state.neighbour(peer, before);
-        if let Err(error) = neighbour.entry.check() {
+        let neighbor = state.neighbor(peer, before);
+        if let Err(error) = neighbor.entry.check() {
             log_limit::info!(of: source(&peer.hop.location), error = %ErrorChain(&error), at = %peer.hop.location, "ignored a gateway with an invalid entry");
             return;
         }
-        let changed = before.is_none_or(|before| !Arc::ptr_eq(&before.entry, &neighbour.entry));
+        let changed = before.is_none_or(|before| !Arc::ptr_eq(&before.entry, &neighbor.entry));
         let is_new = before.is_none();
         if is_new {
             let security = security(peer.hop.principal);
@@ -205,7 +205,7 @@ impl Neighbours {
                 escape_name(&peer.name)
             );
         }
-        state.present.insert(incarnation, neighbour);
+        state.present.insert(incarnation, neighbor);
         self.generation.fetch_add(1, Ordering::Release);
         state
             .parted
@@ -251,7 +251,7 @@ impl Neighbours {
     pub(super) fn to_greet(&self, now: Instant) -> Vec<(Arc<str>, Location)> {
         let mut state = self.state.lock();
         state.parted.retain(|(since, _)| *since + PARTED > now);
-        let present = state.present.values().map(|neighbour| &neighbour.entry);
+        let present = state.present.values().map(|neighbor| &neighbor.entry);
         let parted = state.parted.iter().map(|(_, entry)| entry);
         let all = present.chain(parted).flat_map(|entry| {
             // The transports race the locations of one kind, so one of each kind is enough.
@@ -275,11 +275,11 @@ impl State {
     }
 
     /// Returns the neighbor with this new connection, based on its state before.
-    fn neighbour(&self, peer: &Introduction, before: Option<&Neighbour>) -> Neighbour {
+    fn neighbor(&self, peer: &Introduction, before: Option<&Neighbor>) -> Neighbor {
         let incarnation = peer.hop.location.incarnation();
         let named = |listed: &&Peer| {
-            let dialled = peer.dialled.as_ref();
-            dialled.is_some_and(|dialled| listed.locations.contains(dialled))
+            let dialed = peer.dialed.as_ref();
+            dialed.is_some_and(|dialed| listed.locations.contains(dialed))
         };
         let listed = self.peers.iter().find(named);
         if let Some(listed) = listed
@@ -312,7 +312,7 @@ impl State {
             peer: PeerId::of(peer.hop.principal, Some(&peer.hop.location)),
             role: Role::Gateway,
         };
-        let mut neighbour = before.cloned().unwrap_or_else(|| Neighbour {
+        let mut neighbor = before.cloned().unwrap_or_else(|| Neighbor {
             entry: Arc::new(entry),
             configured: Vec::new(),
             hops: Vec::new(),
@@ -323,20 +323,20 @@ impl State {
             peer: None,
         });
         if let Some(listed) = listed
-            && neighbour.peer.is_none()
+            && neighbor.peer.is_none()
         {
-            neighbour.peer = Some(Arc::clone(&listed.name));
-            neighbour.configured = configured;
-            Arc::make_mut(&mut neighbour.entry).source = Source::Static;
+            neighbor.peer = Some(Arc::clone(&listed.name));
+            neighbor.configured = configured;
+            Arc::make_mut(&mut neighbor.entry).source = Source::Static;
         }
-        neighbour.connections += 1;
-        neighbour.hops.push(peer.hop.location.clone());
-        neighbour.locate();
-        neighbour
+        neighbor.connections += 1;
+        neighbor.hops.push(peer.hop.location.clone());
+        neighbor.locate();
+        neighbor
     }
 }
 
-impl Neighbour {
+impl Neighbor {
     /// Updates the locations of the entry and returns whether they have changed. First come the
     /// locations of the open connections, the latest first. Then come the configured locations over
     /// transports without an open connection. The other configured locations are left out: the peer
@@ -371,7 +371,7 @@ fn source(location: &Location) -> PeerId {
 /// their incarnation.
 pub(crate) struct View {
     pub(crate) all: MergedDirectory,
-    pub(crate) neighbours: Arc<Neighbours>,
+    pub(crate) neighbors: Arc<Neighbors>,
 }
 
 impl Directory for View {
@@ -381,9 +381,9 @@ impl Directory for View {
 
     fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
         let listed = self.all.known_incarnation(incarnation);
-        let state = self.neighbours.state.lock();
-        let neighbour = state.present.get(&incarnation).map(|it| &it.entry);
-        unless_claimed(listed, neighbour)
+        let state = self.neighbors.state.lock();
+        let neighbor = state.present.get(&incarnation).map(|it| &it.entry);
+        unless_claimed(listed, neighbor)
     }
 
     fn refresh(&self) {
@@ -395,17 +395,17 @@ impl Directory for View {
     }
 
     fn generation(&self) -> u64 {
-        let neighbours = self.neighbours.generation.load(Ordering::Acquire);
-        self.all.generation().wrapping_add(neighbours)
+        let neighbors = self.neighbors.generation.load(Ordering::Acquire);
+        self.all.generation().wrapping_add(neighbors)
     }
 
     fn view(&self) -> Arc<dyn DirectoryView> {
-        let state = self.neighbours.state.lock();
+        let state = self.neighbors.state.lock();
         let present = state.present.iter();
         let present = present.map(|(gateway, it)| (*gateway, Arc::clone(&it.entry)));
         Arc::new(PresentView {
             all: self.all.view(),
-            neighbours: present.collect(),
+            neighbors: present.collect(),
         })
     }
 
@@ -428,18 +428,15 @@ impl Directory for View {
 
 /// Returns the listed entry of an incarnation, or that of the connected gateway that has it: other hosts list what
 /// they choose.
-fn unless_claimed(
-    listed: Option<Arc<Entry>>,
-    neighbour: Option<&Arc<Entry>>,
-) -> Option<Arc<Entry>> {
-    let listed = listed.filter(|it| it.reach == Reach::Local || neighbour.is_none());
-    listed.or_else(|| neighbour.cloned())
+fn unless_claimed(listed: Option<Arc<Entry>>, neighbor: Option<&Arc<Entry>>) -> Option<Arc<Entry>> {
+    let listed = listed.filter(|it| it.reach == Reach::Local || neighbor.is_none());
+    listed.or_else(|| neighbor.cloned())
 }
 
 /// A [`View`] at one time.
 struct PresentView {
     all: Arc<dyn DirectoryView>,
-    neighbours: HashMap<Incarnation, Arc<Entry>>,
+    neighbors: HashMap<Incarnation, Arc<Entry>>,
 }
 
 impl DirectoryView for PresentView {
@@ -449,7 +446,7 @@ impl DirectoryView for PresentView {
 
     fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
         let listed = self.all.registered(incarnation);
-        unless_claimed(listed, self.neighbours.get(&incarnation))
+        unless_claimed(listed, self.neighbors.get(&incarnation))
     }
 
     fn all(&self) -> Arc<[Arc<Entry>]> {
@@ -478,8 +475,8 @@ mod tests {
         };
         let elsewhere = Reach::Remote { gateway: GATEWAY };
         let gateway = entry("crex-mts", elsewhere);
-        let found = |listed: Option<Arc<Entry>>, neighbour| {
-            unless_claimed(listed, neighbour).map(|it| it.name.to_string())
+        let found = |listed: Option<Arc<Entry>>, neighbor| {
+            unless_claimed(listed, neighbor).map(|it| it.name.to_string())
         };
         let claim = || Some(entry("stray", elsewhere));
         assert_eq!(found(claim(), Some(&gateway)).as_deref(), Some("crex-mts"));
@@ -495,71 +492,71 @@ mod tests {
     }
 
     /// Creates the introduction of the gateway on a connection from this address.
-    fn introduction(address: &str, dialled: Option<&str>) -> Introduction {
+    fn introduction(address: &str, dialed: Option<&str>) -> Introduction {
         Introduction {
             name: "crex-mts".into(),
             hop: Hop {
                 location: at(address),
                 principal: Principal::Unproved,
             },
-            dialled: dialled.map(|text| text.parse().unwrap()),
+            dialed: dialed.map(|text| text.parse().unwrap()),
             mandate: Mandate::Unproved,
         }
     }
 
-    fn locations(neighbours: &Neighbours) -> Vec<Location> {
-        neighbours.all()[0].entry.locations.clone()
+    fn locations(neighbors: &Neighbors) -> Vec<Location> {
+        neighbors.all()[0].entry.locations.clone()
     }
 
     #[test]
-    fn a_neighbour_is_where_its_latest_connection_comes_from() {
-        let (neighbours, now) = (Neighbours::default(), Instant::now());
+    fn a_neighbor_is_where_its_latest_connection_comes_from() {
+        let (neighbors, now) = (Neighbors::default(), Instant::now());
         let (before, after) = (
             introduction("10.0.0.2:1", None),
             introduction("10.0.0.3:1", None),
         );
-        neighbours.introduced(&before);
-        neighbours.introduced(&after);
-        assert_eq!(locations(&neighbours), [at("10.0.0.3:1"), at("10.0.0.2:1")]);
-        neighbours.introduced(&after);
-        neighbours.parted(now, &before);
-        neighbours.parted(now, &after);
-        assert_eq!(locations(&neighbours), [at("10.0.0.3:1")]);
-        assert_eq!(neighbours.all()[0].connections, 1);
-        neighbours.parted(now, &after);
-        assert!(neighbours.all().is_empty());
+        neighbors.introduced(&before);
+        neighbors.introduced(&after);
+        assert_eq!(locations(&neighbors), [at("10.0.0.3:1"), at("10.0.0.2:1")]);
+        neighbors.introduced(&after);
+        neighbors.parted(now, &before);
+        neighbors.parted(now, &after);
+        assert_eq!(locations(&neighbors), [at("10.0.0.3:1")]);
+        assert_eq!(neighbors.all()[0].connections, 1);
+        neighbors.parted(now, &after);
+        assert!(neighbors.all().is_empty());
     }
 
     #[test]
     fn what_the_configuration_says_counts_where_no_connection_is_open() {
-        let (neighbours, now) = (Neighbours::default(), Instant::now());
-        neighbours.name_peers(vec![Peer {
+        let (neighbors, now) = (Neighbors::default(), Instant::now());
+        neighbors.name_peers(vec![Peer {
             name: "crex".into(),
             locations: ["tcp://crex.local:1", "udp://crex.local:1"]
                 .map(|text| text.parse().unwrap())
                 .to_vec(),
         }]);
-        let (accepted, dialled) = (
+        let (accepted, dialed) = (
             introduction("10.0.0.2:1", None),
             introduction("10.0.0.2:1", Some("tcp://crex.local:1")),
         );
-        neighbours.introduced(&accepted);
-        assert_eq!(neighbours.all()[0].peer, None);
-        neighbours.introduced(&dialled);
+        neighbors.introduced(&accepted);
+        assert_eq!(neighbors.all()[0].peer, None);
+        neighbors.introduced(&dialed);
         // Letters use no other address of this kind while a connection shows the current one.
         let udp: Location = "udp://crex.local:1".parse().unwrap();
         let known = [at("10.0.0.2:1"), udp.with_incarnation(GATEWAY)];
-        assert_eq!(locations(&neighbours), known);
-        assert_eq!(neighbours.all()[0].peer.as_deref(), Some("crex"));
-        neighbours.parted(now, &dialled);
-        assert_eq!(locations(&neighbours), known);
+        assert_eq!(locations(&neighbors), known);
+        assert_eq!(neighbors.all()[0].peer.as_deref(), Some("crex"));
+        neighbors.parted(now, &dialed);
+        assert_eq!(locations(&neighbors), known);
     }
 
     #[test]
-    fn one_neighbour_with_the_name_of_this_gateway_is_reported() {
-        let neighbours = Neighbours::default();
-        neighbours.name_own("crex-mts");
-        let mut state = neighbours.state.lock();
+    fn one_neighbor_with_the_name_of_this_gateway_is_reported() {
+        let neighbors = Neighbors::default();
+        neighbors.name_own("crex-mts");
+        let mut state = neighbors.state.lock();
         assert!(!state.is_namesake("sherpa-mts"));
         assert!(state.is_namesake("crex-mts"));
         assert!(!state.is_namesake("crex-mts"));
@@ -577,13 +574,13 @@ mod tests {
 
     #[test]
     fn those_that_have_parted_are_greeted_for_a_while() {
-        let (neighbours, now) = (Neighbours::default(), Instant::now());
+        let (neighbors, now) = (Neighbors::default(), Instant::now());
         let one = introduction("10.0.0.2:1", None);
         let greeted = vec![("crex-mts".into(), at("10.0.0.2:1"))];
-        neighbours.introduced(&one);
-        assert_eq!(neighbours.to_greet(now), greeted);
-        neighbours.parted(now, &one);
-        assert_eq!(neighbours.to_greet(now + PARTED / 2), greeted);
-        assert_eq!(neighbours.to_greet(now + PARTED), []);
+        neighbors.introduced(&one);
+        assert_eq!(neighbors.to_greet(now), greeted);
+        neighbors.parted(now, &one);
+        assert_eq!(neighbors.to_greet(now + PARTED / 2), greeted);
+        assert_eq!(neighbors.to_greet(now + PARTED), []);
     }
 }

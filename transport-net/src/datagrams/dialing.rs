@@ -1,4 +1,4 @@
-//! The handshake of the dialling side: hello, cookie, hello with the cookie.
+//! The handshake of the dialing side: hello, cookie, hello with the cookie.
 //!
 //! A hello is sent to all addresses of the peer, one after the other and without waiting for the
 //! first to fail (RFC 8305). The first address that answers is used. The protocol writes the hello
@@ -28,7 +28,7 @@ pub(crate) trait Greeting {
 }
 
 #[derive(Debug)]
-pub(crate) struct Dialling<G: Greeting> {
+pub(crate) struct Dialing<G: Greeting> {
     greeting: G,
     deadline: Instant,
     candidates: Vec<Candidate<G::Cookie>>,
@@ -45,7 +45,7 @@ struct Candidate<C> {
     greeted: Option<Instant>,
 }
 
-impl<G: Greeting> Dialling<G> {
+impl<G: Greeting> Dialing<G> {
     pub(crate) fn new(greeting: G, deadline: Instant) -> Self {
         Self {
             greeting,

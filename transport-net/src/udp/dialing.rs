@@ -3,11 +3,11 @@
 use std::net::SocketAddr;
 
 use super::packet::{self, Cookie, NO_COOKIE};
-use crate::datagrams::dialling::Greeting;
+use crate::datagrams::dialing::Greeting;
 use crate::hello::Hello;
 
 /// The handshake of a connection that this side opens.
-pub(crate) type Dialling = crate::datagrams::dialling::Dialling<OwnHello>;
+pub(crate) type Dialing = crate::datagrams::dialing::Dialing<OwnHello>;
 
 /// The hello of this service, with its number of the connection.
 #[derive(Debug)]
