@@ -24,7 +24,7 @@ use crate::{lock_slot, presence};
 /// Beyond it letters stay in the agent's queue, and their senders wait.
 const MAX_SET_ASIDE: usize = 1_024;
 
-/// The same in bytes of their letters; one message is always set aside.
+/// Maximum bytes of the letters of such messages. One message is always set aside.
 const MAX_SET_ASIDE_BYTES: usize = 64 << 20;
 
 /// The messages that one reader received for another.

@@ -20,7 +20,8 @@ use crate::domain_dir::{DomainDir, DomainDirError};
 /// Time between two checks for removed files while the kernel reports no removals.
 const CHECK_EVERY: Duration = Duration::from_secs(5);
 
-/// The same while it does. It does not report the removal of a level above the domains.
+/// Time between two checks for removed files while the kernel reports removals. It does not report the
+/// removal of a level above the domains.
 const WATCHED_CHECK_EVERY: Duration = Duration::from_secs(60);
 
 /// Time in which removals are collected.

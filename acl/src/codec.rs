@@ -57,7 +57,7 @@ impl Message {
     /// Number of bytes that [`encode_into`](Self::encode_into) writes.
     ///
     /// # Errors
-    /// The same as of [`encode`](Self::encode).
+    /// The errors of [`encode`](Self::encode).
     pub fn encoded_len(
         &self,
         representation: Representation,
@@ -75,7 +75,7 @@ impl Message {
     /// the buffer may hold a part of the message.
     ///
     /// # Errors
-    /// The same as of [`encode`](Self::encode).
+    /// The errors of [`encode`](Self::encode).
     ///
     /// # Panics
     /// If the buffer has a fixed capacity and less space than that.

@@ -25,11 +25,11 @@ const MAX_TEXT: usize = 1_024;
 pub struct Limits {
     /// Maximum number of goals that run or wait.
     pub goals: usize,
-    /// The same for one client, and for its conversations about them.
+    /// Maximum number of goals of one client that run or wait, and of its conversations about goals.
     pub goals_of_client: usize,
     /// Maximum number of ended goals that are stored.
     pub ended: usize,
-    /// The same for one client.
+    /// Maximum number of ended goals of one client that are stored.
     pub ended_of_client: usize,
     /// Maximum size of arguments of waiting goals and of stored results of one client, in bytes. All
     /// clients together have eight times as much.

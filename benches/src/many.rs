@@ -27,7 +27,7 @@ pub(super) struct Many {
     pub(super) small_us: f64,
     /// One message to all, its content loaned and written.
     pub(super) together_us: f64,
-    /// The same content in a message of its own for each.
+    /// The content in a message of its own for each receiver.
     pub(super) copies_us: f64,
     /// Ratio of `together` to the sum of the first two: the median over all rounds.
     pub(super) ratio: f64,

@@ -46,7 +46,7 @@ impl Effort {
     ///
     /// # Errors
     ///
-    /// Those of [`full`](Self::full).
+    /// The errors of [`full`](Self::full).
     pub fn quick(sizes: impl IntoIterator<Item = u64>) -> Result<Self, BenchError> {
         Ok(Self {
             sizes: checked(sizes)?,

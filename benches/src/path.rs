@@ -12,7 +12,7 @@ pub(super) enum Mechanism {
     Agents(Kind),
     /// Two agents on two hosts, and a gateway on each.
     Gateways(Kind),
-    /// The same with gateways that have authenticated each other: TCP with TLS, or QUIC.
+    /// Two agents on two hosts, and gateways that have authenticated each other: TCP with TLS, or QUIC.
     Secured(Kind),
     /// Encoded letters through the shared memory transport alone.
     Letters,
@@ -43,7 +43,7 @@ impl Mechanism {
         }
     }
 
-    /// The same path without encryption, measured in the same rounds.
+    /// The path without encryption, measured in the same rounds.
     pub(super) fn plain(self) -> Option<Self> {
         matches!(self, Self::Secured(_)).then_some(Self::Gateways(Kind::Tcp))
     }

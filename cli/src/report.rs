@@ -94,7 +94,7 @@ impl Failure {
         }
     }
 
-    /// The same errors with another exit code.
+    /// These errors with another exit code.
     pub(crate) fn with_code(self, code: u8) -> Self {
         Self { code, ..self }
     }

@@ -493,8 +493,8 @@ impl Monitor {
         local.or_else(|| self.place_among(id, &alike, header, observed))
     }
 
-    /// Finds the conversation of a message among those with its identifier, of which the roles of agents
-    /// show none.
+    /// Finds the conversation of a message among those with its identifier, when the roles of the agents do not
+    /// select one.
     #[inline(never)]
     fn place_among<'s>(
         &self,

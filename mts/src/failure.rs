@@ -57,7 +57,7 @@ impl Failed {
         }
     }
 
-    /// The same for a message that is decoded already.
+    /// Describes the failure of a letter whose message is decoded.
     pub(crate) fn of_message(message: &Message, letter: &Letter) -> Option<Self> {
         if *message.performative() == Performative::Failure {
             return None;
@@ -71,7 +71,7 @@ impl Failed {
         })
     }
 
-    /// The same for a message that cannot be decoded.
+    /// Describes the failure of a letter whose message cannot be decoded.
     pub(crate) fn of_envelope(letter: &Letter) -> Option<Self> {
         Some(Self {
             sender: brief(&letter.parse_envelope().ok()?.effective().from?)?,

@@ -31,7 +31,7 @@ const READ_AGAIN: Duration = Duration::from_secs(30);
 pub(super) struct Greetings {
     /// The agents that were greeted or wait.
     known: HashSet<Peer>,
-    /// Those of them that wait.
+    /// The known agents that wait for a greeting.
     waiting: HashSet<Peer>,
     peers: HashMap<PeerId, OfPeer>,
     /// The peers with agents that wait, in the order of their turns.

@@ -45,7 +45,7 @@ impl Network {
         Self::of(Family::Both, hosts)
     }
 
-    /// The same with these addresses.
+    /// Creates a network of hosts with addresses of this family.
     ///
     /// # Panics
     /// If the network cannot be created, or for more than 200 hosts.
@@ -121,7 +121,7 @@ impl Host {
         self.addresses_with(self.number)
     }
 
-    /// The same for another number: those that [`move_to`](Self::move_to) gives it.
+    /// The addresses of a host with another number, which [`move_to`](Self::move_to) gives it.
     #[must_use]
     pub fn addresses_with(&self, number: u8) -> Vec<String> {
         let v4 = || ipv4(number).to_string();

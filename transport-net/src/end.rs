@@ -74,7 +74,7 @@ const UNKNOWN_CAUSES: &str = "possible causes: the peer requires keys and this h
                               here, see `fipa keys`), it has another version of the protocol (install the same \
                               release of fipa on both hosts), it is ending, or no fipa gateway listens there";
 
-/// The same if the peer has proved its identity.
+/// The possible causes if a peer with a proved identity closes a connection before its hello.
 const PROVED_CAUSES: &str = "possible causes: the peer has another version of the protocol (install the same \
                              release of fipa on both hosts), it does not trust this host (see its log), or it is \
                              ending";

@@ -390,7 +390,7 @@ impl PeerProcess {
 /// processor time.
 const POLL_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// The same for processes that do not listen yet.
+/// Maximum wait for processes that do not listen yet.
 const START_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// Pause between two checks of the poll counters.

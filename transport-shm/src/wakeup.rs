@@ -164,7 +164,7 @@ impl Account {
     /// Takes a parcel out of the mailbox with `take`, or finds that there is none.
     ///
     /// # Errors
-    /// Those of `take`.
+    /// The errors of the function `take`.
     pub(crate) fn take<T, E>(
         &mut self,
         words: &StatusWords,

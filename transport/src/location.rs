@@ -29,7 +29,7 @@ pub enum Kind {
     Udt,
     /// Letters in multipart messages over HTTP (FIPA00084): JADE's transport between platforms.
     Http,
-    /// The same over TLS.
+    /// Letters in multipart messages over HTTP and TLS.
     Https,
 }
 
@@ -113,9 +113,11 @@ pub enum Signature {
     /// An XML envelope and a string message, whose delivery is not confirmed: JADE. Over TCP, its
     /// proxy agent reads one letter per connection.
     JadeProxy,
-    /// The same with an XML message, over HTTP, to a platform with JADE's codec for XML.
+    /// An XML envelope and an XML message, whose delivery is not confirmed, over HTTP, to a platform with
+    /// JADE's codec for XML.
     JadeXml,
-    /// The same with a bit-efficient message, over HTTP, to a platform with JADE's codec for it.
+    /// An XML envelope and a bit-efficient message, whose delivery is not confirmed, over HTTP, to a platform
+    /// with JADE's codec for it.
     JadeBitEfficient,
 }
 

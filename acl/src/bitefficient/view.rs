@@ -36,7 +36,7 @@ pub(crate) fn view_split(payload: &Payload) -> Result<MessageView<'_>, DecodeErr
 /// Reads a message in one piece and notes the meaning of every byte.
 ///
 /// # Errors
-/// The same as of [`view`].
+/// The errors of [`view`].
 pub(crate) fn view_noting(
     bytes: &[u8],
     base: usize,

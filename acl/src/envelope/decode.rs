@@ -80,7 +80,7 @@ impl Letter {
     /// Splits a letter like [`split`](Self::split) and decodes its envelope.
     ///
     /// # Errors
-    /// The same as of [`split`](Self::split).
+    /// The errors of [`split`](Self::split).
     pub fn decode(mut bytes: Bytes) -> Result<(Envelope, Self), DecodeError> {
         let (envelope, envelope_len) = Envelope::decode(&bytes)?;
         let encoded = bytes.split_to(envelope_len);

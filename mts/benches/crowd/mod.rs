@@ -64,7 +64,7 @@ impl Crowd {
         self.send_and(receiver, Core::poll_action);
     }
 
-    /// The same with watching turned on.
+    /// Sends a letter while letters are watched.
     #[allow(dead_code, reason = "only one of two benches uses it")]
     pub(crate) fn send_watched(&mut self, receiver: &Arc<str>) {
         self.core.watch(true);

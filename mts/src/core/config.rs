@@ -46,7 +46,7 @@ pub struct CoreConfig {
     pub custody_bytes: usize,
     /// Timeout of an attempt, for a small letter.
     pub attempt_timeout: Duration,
-    /// The same towards a legacy peer. It is longer than the timeouts of the transports: when an
+    /// Timeout of an attempt to a legacy peer. It is longer than the timeouts of the transports: when an
     /// attempt has begun, the letter cannot be sent again, because a legacy peer takes a copy for a
     /// new letter.
     pub legacy_attempt_timeout: Duration,

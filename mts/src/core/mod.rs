@@ -129,9 +129,9 @@ const LANES_AT_ONCE: usize = 16;
 
 /// Empty lanes are dropped when there are more lanes than this.
 const IDLE_LANES: usize = 1024;
-/// Time for which an empty lane is kept nevertheless.
+/// Minimum time for which a lane without letters is kept.
 const IDLE_TIME: Duration = Duration::from_secs(60);
-/// The same when many lanes are created in a short time. A lane that is dropped too early costs time,
+/// This minimum when many lanes are created in a short time. A lane that is dropped too early costs time,
 /// but no letter: its next letter waits longer for a predecessor that failed.
 const IDLE_TIME_IN_A_CROWD: Duration = Duration::from_secs(1);
 

@@ -18,7 +18,7 @@ pub(super) enum Concern {
     Reachable(Option<Incarnation>),
     /// Lanes without letters may be dropped.
     Idle,
-    /// The same when many lanes were created in a short time.
+    /// Lanes without letters may be dropped earlier, because many lanes were created in a short time.
     Crowd,
 }
 

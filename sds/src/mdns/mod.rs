@@ -390,7 +390,7 @@ impl Announcement {
 /// for the one that is leaving.
 const SETTLING: Duration = Duration::from_secs(3);
 
-/// The same for a record in which only the locations change: letters do not arrive until other
+/// Time for which a record stays unchanged before only its locations change: letters do not arrive until other
 /// gateways have it. It may be announced before the previous record has left all caches.
 const MOVING: Duration = Duration::from_secs(1);
 

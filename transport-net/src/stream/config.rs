@@ -157,7 +157,7 @@ pub struct Limits {
     /// acceptance. The next one evicts the oldest that has sent no byte; when all have sent a byte,
     /// the next one itself is reset. Default 512.
     pub max_unread_per_address: usize,
-    /// The same for all addresses together. Default 1024.
+    /// Maximum number of connections of all addresses that wait unread. Default 1024.
     pub max_unread: usize,
     /// Maximum number of connections that the peers with one certificate, or the peers at one
     /// address that have proved nothing, have opened and introduced themselves on. Default 64. It

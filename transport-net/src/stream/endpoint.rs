@@ -59,7 +59,7 @@ use crate::rate_limit::PeerRateLimits;
 /// service.
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// The same when the service has announced that it is elsewhere.
+/// Time in which it must respond when the service has announced that it is elsewhere.
 const LEFT_TIMEOUT: Duration = Duration::from_millis(200);
 
 /// Maximum number of silent connections that are pinged before an unproved peer is refused.

@@ -96,7 +96,7 @@ const CONNECT_CAUSES: &str = "possible causes: this host has keys and the peer h
                               security.keys here), the peer is ending or has too many connections, or no fipa \
                               gateway listens there";
 
-/// The same for a peer that began TLS, and therefore has keys.
+/// The possible causes if a peer that began TLS, and therefore has keys, closes the connection without an alert.
 const ACCEPT_CAUSES: &str = "the peer may have ended or given up; see its log";
 
 /// Returns the error text for a failed handshake. `causes` are those of an end without an alert.

@@ -50,8 +50,8 @@ pub struct UdpLimits {
     /// Maximum number of bytes of parcels that wait for an earlier one, on all connections
     /// together; a parcel beyond it is accepted when the peer retransmits it. Default 64 MiB.
     pub max_incoming: usize,
-    /// The same for one source: one address (with IPv6, one network of 64 bits), and with twice as much
-    /// all loopback addresses together. Default 16 MiB.
+    /// Maximum number of such bytes of one source: one address (with IPv6, one network of 64 bits), and with
+    /// twice as much all loopback addresses together. Default 16 MiB.
     pub max_incoming_per_source: usize,
     /// Timeout of opening a connection. Default 2 s.
     pub connect_timeout: Duration,

@@ -73,8 +73,8 @@ pub struct UdtLimits {
     /// of more than 64 KiB reserves `max_letter` and 4 MiB for packets that arrive out of order.
     /// Default 64 MiB.
     pub max_incoming: usize,
-    /// The same for one source: one address (with IPv6, one network of 64 bits), and with twice as much
-    /// all loopback addresses together. Default 16 MiB.
+    /// Maximum number of such bytes of one source: one address (with IPv6, one network of 64 bits), and with
+    /// twice as much all loopback addresses together. Default 16 MiB.
     pub max_incoming_per_source: usize,
     /// Timeout of opening a connection. Default 3 s, which is that of libudt.
     pub connect_timeout: Duration,

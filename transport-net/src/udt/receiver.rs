@@ -295,7 +295,7 @@ impl Receiver {
         !self.arrived.is_empty() || !self.too_large.is_empty()
     }
 
-    /// Whether parts of a letter have arrived.
+    /// Whether no part of a letter has arrived.
     pub(crate) fn is_idle(&self) -> bool {
         self.letter.is_none() && self.held.is_empty()
     }

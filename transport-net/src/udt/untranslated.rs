@@ -21,7 +21,7 @@ use crate::legacy::dialect::translate;
 pub(crate) struct Untranslated {
     /// The locations with letters.
     queues: HashMap<Location, Queue>,
-    /// The same locations in the order of their turns, without the current one.
+    /// The locations with letters in the order of their turns, without the current one.
     turns: VecDeque<Location>,
     /// The location whose first letter is being translated. `None` when that letter was abandoned.
     current: Option<Location>,

@@ -586,7 +586,7 @@ impl Demo {
         )
     }
 
-    /// The same by an agent with `monitor.check=enforce`: the violating message is not sent, and a
+    /// A violation by an agent with `monitor.check=enforce`: the violating message is not sent, and a
     /// correct message is still accepted afterwards.
     async fn enforced_by_agent(&mut self) -> Result<String, String> {
         let set = "monitor.check=enforce";
