@@ -304,7 +304,7 @@ async fn a_description_travels_from_the_gateway_of_its_agent_only() {
         .unwrap();
     let df = rover.df().unwrap();
     finds(&df, &["crane"]).await;
-    // The agent registers with the other host, too: that description hides the one that has travelled.
+    // The agent registers with the other host, too: that description hides the one that has traveled.
     let there = crane.df_of(df.id().clone());
     knows(&abroad, df.id().name()).await;
     let here = there

@@ -11,7 +11,7 @@ const BAR: i32 = 13;
 const GAP: i32 = 11;
 const INK: RGBColor = RGBColor(0x33, 0x3a, 0x44);
 const FAINT: RGBColor = RGBColor(0xdd, 0xe1, 0xe6);
-const COLOURS: [RGBColor; 2] = [RGBColor(0x1f, 0x6f, 0xd1), RGBColor(0x0b, 0x7a, 0x75)];
+const COLORS: [RGBColor; 2] = [RGBColor(0x1f, 0x6f, 0xd1), RGBColor(0x0b, 0x7a, 0x75)];
 const MARK: RGBColor = RGBColor(0xc9, 0x5d, 0x12);
 
 /// The contents of a diagram.
@@ -112,13 +112,13 @@ fn draw(picture: &Picture<'_>, text: &mut String) -> Result<(), Box<dyn std::err
     let size = (u32::try_from(WIDTH)?, u32::try_from(height)?);
     let area = SVGBackend::with_string(text, size).into_drawing_area();
     area.fill(&WHITE)?;
-    let font = |size: u32, colour: &RGBColor| ("sans-serif", size).into_font().color(colour);
+    let font = |size: u32, color: &RGBColor| ("sans-serif", size).into_font().color(color);
     let anchored = |horizontal| font(12, &INK).pos(Pos::new(horizontal, VPos::Center));
     area.draw_text(picture.title, &font(19, &INK), (24, 16))?;
     let mut at = 24;
     for (series, name) in picture.series.iter().enumerate() {
-        let colour = colour_of(series);
-        area.draw(&Rectangle::new([(at, 50), (at + 12, 62)], colour.filled()))?;
+        let color = color_of(series);
+        area.draw(&Rectangle::new([(at, 50), (at + 12, 62)], color.filled()))?;
         area.draw_text(name, &font(13, &INK), (at + 18, 49))?;
         at += 110;
     }
@@ -141,10 +141,10 @@ fn draw(picture: &Picture<'_>, text: &mut String) -> Result<(), Box<dyn std::err
         let middle = y + BAR * i32::try_from(group.bars.len())? / 2;
         area.draw_text(&group.name, &anchored(HPos::Right), (LEFT - 10, middle))?;
         for bar in &group.bars {
-            let colour = colour_of(bar.series);
+            let color = color_of(bar.series);
             let end = scale.place(bar.value);
             let corners = [(LEFT, y + 1), (end, y + BAR - 1)];
-            area.draw(&Rectangle::new(corners, colour.filled()))?;
+            area.draw(&Rectangle::new(corners, color.filled()))?;
             if bar.deviation > 0.0 {
                 let [low, high] = [-bar.deviation, bar.deviation]
                     .map(|deviation| scale.place(bar.value + deviation));
@@ -164,6 +164,6 @@ fn draw(picture: &Picture<'_>, text: &mut String) -> Result<(), Box<dyn std::err
     Ok(())
 }
 
-fn colour_of(series: usize) -> RGBColor {
-    COLOURS.get(series).copied().unwrap_or(INK)
+fn color_of(series: usize) -> RGBColor {
+    COLORS.get(series).copied().unwrap_or(INK)
 }

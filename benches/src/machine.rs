@@ -22,7 +22,6 @@ pub struct Machine {
     pub(super) system: String,
     pub(super) fipa: &'static str,
     /// Whether the program was built with optimization.
-    #[serde(rename = "optimised")]
     pub(super) optimized: bool,
     /// Share of all processors that other processes used just before, 0 to 1.
     pub(super) busy: f64,

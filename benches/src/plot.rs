@@ -20,7 +20,7 @@ const FAINT: RGBColor = RGBColor(0xdd, 0xe1, 0xe6);
 /// One line of the diagram.
 struct Line {
     name: String,
-    colour: RGBColor,
+    color: RGBColor,
     /// Whether the line is a limit, which is drawn thin.
     is_limit: bool,
     points: Vec<(f64, f64)>,
@@ -56,7 +56,7 @@ fn lines(rows: &[Row]) -> Vec<Line> {
         if !wanted || row.mechanism == Mechanism::Letters {
             continue;
         }
-        let (order, colour) = look(row.mechanism, row.fill, row.wait);
+        let (order, color) = look(row.mechanism, row.fill, row.wait);
         let wait = match row.wait {
             Wait::Spin => "spinning",
             Wait::Block => "blocking",
@@ -70,7 +70,7 @@ fn lines(rows: &[Row]) -> Vec<Line> {
             .entry((order, row.fill, row.wait))
             .or_insert_with(|| Line {
                 name,
-                colour,
+                color,
                 is_limit: row.mechanism.limit().is_none(),
                 points: Vec::new(),
             });
@@ -117,7 +117,7 @@ fn draw(
 ) -> Result<(), Box<dyn std::error::Error>> {
     let area = SVGBackend::with_string(text, (WIDTH, HEIGHT)).into_drawing_area();
     area.fill(&WHITE)?;
-    let style = |size: u32, colour: &RGBColor| ("sans-serif", size).into_font().color(colour);
+    let style = |size: u32, color: &RGBColor| ("sans-serif", size).into_font().color(color);
     area.draw_text(
         "One-way time from send to the decoded message (median)",
         &style(20, &INK),
@@ -145,10 +145,10 @@ fn draw(
     for line in lines {
         let width = if line.is_limit { 1 } else { 3 };
         let points = line.points.iter().copied();
-        chart.draw_series(LineSeries::new(points, line.colour.stroke_width(width)))?;
+        chart.draw_series(LineSeries::new(points, line.color.stroke_width(width)))?;
         let dots = line.points.iter();
         let size = if line.is_limit { 2 } else { 4 };
-        chart.draw_series(dots.map(|point| Circle::new(*point, size, line.colour.filled())))?;
+        chart.draw_series(dots.map(|point| Circle::new(*point, size, line.color.filled())))?;
     }
     for (line, height) in lines.iter().zip(heights(&chart, lines)) {
         let Some(end) = line.points.last() else {
@@ -158,7 +158,7 @@ fn draw(
         let weight = if line.is_limit { 12 } else { 14 };
         area.draw_text(
             &line.name,
-            &style(weight, &line.colour),
+            &style(weight, &line.color),
             (right + 12, height - 7),
         )?;
     }

@@ -10,7 +10,7 @@
 #![allow(clippy::print_stdout, reason = "the test prints its figures")]
 
 mod fuzzing;
-mod siege;
+mod load;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use fipa::keys::Keys;
 use fipa_testbed::until;
 use fuzzing::trusted::{client, quic};
 use fuzzing::{Writer, datagram, stream};
-use siege::{Gateway, Pair, Usage, percentiles};
+use load::{Gateway, Pair, Usage, percentiles};
 use tempfile::TempDir;
 
 /// Concurrent conversations.
@@ -125,8 +125,8 @@ impl Setup {
             .unwrap();
         let pair = Pair::new(directory.path(), secured, "fuzzed");
         let tls = secured.then(|| {
-            let rogue = siege::keys(directory.path().join("rogue"), "rogue");
-            siege::befriend(&Keys::at(directory.path().join("target")), &rogue);
+            let rogue = load::keys(directory.path().join("rogue"), "rogue");
+            load::befriend(&Keys::at(directory.path().join("target")), &rogue);
             client(&rogue, "rogue")
         });
         let quic = tls.as_ref().map(quic);
@@ -278,8 +278,8 @@ fn settled(gateway: &Gateway, is: impl Fn(&Usage) -> bool) -> Usage {
 }
 
 fn fuzz(secured: bool) {
-    let seconds = siege::number("FIPA_FUZZ_SECONDS").unwrap_or(4);
-    let seed = siege::number("FIPA_FUZZ_SEED").unwrap_or_else(|| fastrand::u64(..));
+    let seconds = load::number("FIPA_FUZZ_SECONDS").unwrap_or(4);
+    let seed = load::number("FIPA_FUZZ_SEED").unwrap_or_else(|| fastrand::u64(..));
     let mode = if secured { "with keys" } else { "without keys" };
     println!("{mode}: FIPA_FUZZ_SEED={seed}, {seconds} s");
     let setup = Setup::new(secured);

@@ -232,7 +232,7 @@ fn main() {
         "letters/s"
     );
     // The hosts that an exchange connects with are limited.
-    let most = Exchange::MAX_NEIGHBOURS as u64 + 1;
+    let most = Exchange::MAX_NEIGHBORS as u64 + 1;
     for agents in [10, 40] {
         let mut rows = Vec::new();
         for hosts in [10, 100, most] {

@@ -1193,7 +1193,7 @@ fn the_number_of_agents_of_a_neighbor_is_bounded() {
         .collect();
     exchange.handle_neighbors(now, &crowd);
     let (known, _) = exchange.goodbye();
-    assert_eq!(known.len(), Exchange::MAX_NEIGHBOURS);
+    assert_eq!(known.len(), Exchange::MAX_NEIGHBORS);
 }
 
 /// Returns the letters with all agents of a gateway: `count` names that begin with `prefix`, with descriptions of
@@ -1320,15 +1320,15 @@ fn peers_with_the_longest_lists_are_cut_and_a_small_one_is_complete() {
 #[test]
 fn gateways_of_one_host_keep_no_other_host_from_being_a_neighbor() {
     let mut exchange = Exchange::new(0);
-    let hosts = std::iter::repeat_n(1, Exchange::MAX_NEIGHBOURS).chain([2, 3, 2]);
+    let hosts = std::iter::repeat_n(1, Exchange::MAX_NEIGHBORS).chain([2, 3, 2]);
     let all = present(hosts);
-    let (crowd, others) = all.split_at(Exchange::MAX_NEIGHBOURS);
+    let (crowd, others) = all.split_at(Exchange::MAX_NEIGHBORS);
     exchange.handle_neighbors(Instant::now(), crowd);
     tell_all(&mut exchange, 1, &full("crowd-", 10, 0));
     for _ in 0..3 {
         exchange.handle_neighbors(Instant::now(), &all);
         let (known, _) = exchange.goodbye();
-        assert_eq!(known.len(), Exchange::MAX_NEIGHBOURS);
+        assert_eq!(known.len(), Exchange::MAX_NEIGHBORS);
         assert!(others.iter().all(|it| known.contains(&it.mts.incarnation)));
     }
     assert_eq!(count(&exchange, "crowd-"), 10);
@@ -1554,7 +1554,7 @@ fn df_entries_that_are_too_long_or_of_others_are_ignored() {
 
 /// Three gateways with certificates, and a fourth one that sends false entries: names, registrations
 /// and addresses of the others, and the incarnations of their gateways.
-struct Besieged {
+struct HostileLoad {
     world: World,
     liar: usize,
     /// Whether the liar has a trusted certificate. If so, it may keep a name or a registration that
@@ -1565,7 +1565,7 @@ struct Besieged {
     listed: BTreeMap<(usize, String), usize>,
 }
 
-impl Besieged {
+impl HostileLoad {
     fn new(seed: u64) -> Self {
         let mut world = World::new(4, seed);
         let liar = 3;
@@ -1812,10 +1812,10 @@ fn a_neighbor_that_lies_neither_removes_nor_takes_over_agents_of_others() {
     };
     for seed in seeds {
         println!("seed {seed}");
-        let mut besieged = Besieged::new(seed);
+        let mut load = HostileLoad::new(seed);
         for _ in 0..120 {
-            besieged.act();
+            load.act();
         }
-        besieged.finish();
+        load.finish();
     }
 }

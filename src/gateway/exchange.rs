@@ -337,7 +337,7 @@ impl Greetings {
     /// Time after which a gateway that has not become a neighbor is greeted again.
     const AGAIN: Duration = Duration::from_secs(1800);
     /// Number of neighbors from which on no gateway is greeted. Connections are left for letters.
-    const NEIGHBOURS: usize = 128;
+    const NEIGHBORS: usize = 128;
     /// Maximum number of gateways that are remembered.
     const REMEMBERED: usize = 1024;
 
@@ -379,7 +379,7 @@ impl Greetings {
         neighbors: &HashSet<Incarnation>,
     ) -> Vec<Arc<Entry>> {
         self.greeted.retain(|_, at| now < *at + Self::AGAIN);
-        let room = Self::NEIGHBOURS.saturating_sub(neighbors.len());
+        let room = Self::NEIGHBORS.saturating_sub(neighbors.len());
         let room = room.min(Self::REMEMBERED.saturating_sub(self.greeted.len()));
         let mut next = Vec::new();
         for entry in entries {
@@ -671,7 +671,7 @@ mod tests {
         // A gateway that did not become a neighbor, after a while.
         assert_eq!(next(1801, &entries, &[1, 2, 3, 5]), [4, 6, 7, 8]);
         // With many neighbors, none.
-        let many: Vec<u64> = (100..100 + Greetings::NEIGHBOURS as u64).collect();
+        let many: Vec<u64> = (100..100 + Greetings::NEIGHBORS as u64).collect();
         assert_eq!(next(9000, &entries, &many), [0; 0]);
         assert_eq!(next(9000, &entries, &many[1..]), [1]);
         // Any number of announced gateways takes bounded memory.

@@ -76,7 +76,7 @@ impl ExchangeQueues {
         }
         if !queue.gateways.contains_key(&gateway) {
             // More are no neighbors.
-            if queue.gateways.len() >= Exchange::MAX_NEIGHBOURS {
+            if queue.gateways.len() >= Exchange::MAX_NEIGHBORS {
                 return;
             }
             queue.turns.push_back(gateway);

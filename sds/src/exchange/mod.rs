@@ -211,7 +211,7 @@ impl Exchange {
     /// the peers with most are cut. Each of `n` peers has room for at least `MAX_TOTAL / n`.
     pub const MAX_TOTAL: usize = shares::MAX_TOTAL / shares::PER_ENTRY;
     /// Maximum number of neighbors.
-    pub const MAX_NEIGHBOURS: usize = 256;
+    pub const MAX_NEIGHBORS: usize = 256;
     /// Maximum length of a letter's content, in bytes.
     pub const MAX_CONTENT: usize = 1024 * 1024;
     /// Maximum length of a DF entry, in bytes. A longer one is not sent.
@@ -435,7 +435,7 @@ impl Exchange {
     /// Makes room for another neighbor of this peer: ends one of the peer with most neighbors if there are
     /// too many. Returns whether there is room.
     fn make_room(&mut self, peer: &PeerId) -> bool {
-        if self.neighbors.len() < Self::MAX_NEIGHBOURS {
+        if self.neighbors.len() < Self::MAX_NEIGHBORS {
             return true;
         }
         let mut neighbors: HashMap<PeerId, Vec<Incarnation>> = HashMap::new();
@@ -550,7 +550,7 @@ impl Exchange {
         if !self.neighbors.contains_key(&from) {
             if !self.early.contains(&from) {
                 // A peer can connect under many incarnations, which never become neighbors.
-                if self.early.len() >= Self::MAX_NEIGHBOURS {
+                if self.early.len() >= Self::MAX_NEIGHBORS {
                     self.early.pop_front();
                 }
                 self.early.push_back(from);

@@ -40,7 +40,7 @@ use Vice::*;
 const PEERS: usize = 50;
 
 /// Environment variable with the kinds of hostile peers, separated by commas. There is one peer of each.
-const KINDS: &str = "FIPA_SIEGE_KINDS";
+const KINDS: &str = "FIPA_LOAD_KINDS";
 
 /// Behaviors against a gateway with keys. The gateway never reads letters of untrusted peers.
 pub(crate) const AT_KEYS: [Vice; 10] = [

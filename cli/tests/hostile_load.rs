@@ -2,22 +2,22 @@
 //!
 //! The test prints the delivery times in three states: without an attack, during an attack on the
 //! gateway, and during an attack on a sink that accepts and ignores everything. The third state shows
-//! the cost of the hostile peers themselves on the shared CPUs. `FIPA_SIEGE_SECONDS` is the duration of
+//! the cost of the hostile peers themselves on the shared CPUs. `FIPA_LOAD_SECONDS` is the duration of
 //! each state, in seconds, repeated three times; without it each state takes one second, once. The
 //! figures are meaningful only in a release build on an otherwise idle machine:
 //!
 //! ```console
-//! $ FIPA_SIEGE_SECONDS=10 cargo test --release -p fipa-cli --test besieged -- --nocapture --test-threads=1
+//! $ FIPA_LOAD_SECONDS=10 cargo test --release -p fipa-cli --test hostile_load -- --nocapture --test-threads=1
 //! ```
 //!
-//! With `FIPA_SIEGE_KINDS=silence,letters` there is one hostile peer of each of these kinds instead of fifty
-//! peers. The kinds are the behaviors in `siege/hostile.rs`, in lower case.
+//! With `FIPA_LOAD_KINDS=silence,letters` there is one hostile peer of each of these kinds instead of fifty
+//! peers. The kinds are the behaviors in `load/hostile.rs`, in lower case.
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 #![allow(clippy::print_stdout, reason = "the test prints its figures")]
 
 mod fuzzing;
-mod siege;
+mod load;
 
 use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
@@ -30,12 +30,12 @@ use fipa::keys::Keys;
 use fipa_testbed::{ChildGuard, frame, ignored_test};
 use fuzzing::trusted::{client, quic};
 use fuzzing::{Writer, datagram, stream};
-use siege::hostile::{self, AT_KEYS, IN_THE_CLEAR, Means};
-use siege::{percentiles, usage};
+use load::hostile::{self, AT_KEYS, IN_THE_CLEAR, Means};
+use load::{percentiles, usage};
 
 /// Environment variable with the orders of the hostile peers: whether there are keys, the directory, and
 /// two addresses or `sink`.
-const ORDERS: &str = "FIPA_SIEGE_AT";
+const ORDERS: &str = "FIPA_LOAD_AT";
 
 /// Number of prepared first datagrams of connections. A datagram is reused after its connection has
 /// ended.
@@ -130,15 +130,15 @@ struct Account {
     hostile: Duration,
 }
 
-fn besieged(secured: bool) {
-    let asked = siege::number("FIPA_SIEGE_SECONDS");
+fn under_load(secured: bool) {
+    let asked = load::number("FIPA_LOAD_SECONDS");
     let (seconds, rounds) = asked.map_or((1, 1), |seconds| (seconds, 3));
-    let place = tempfile::Builder::new().prefix("siege-").tempdir().unwrap();
+    let place = tempfile::Builder::new().prefix("load-").tempdir().unwrap();
     if secured {
         // No gateway trusts this key.
-        siege::keys(place.path().join("stranger"), "stranger");
+        load::keys(place.path().join("stranger"), "stranger");
     }
-    let pair = siege::Pair::new(place.path(), secured, "besieged");
+    let pair = load::Pair::new(place.path(), secured, "hostile-load");
     let talk = pair.rover.talk("arm");
     talk.goes_on(100);
     talk.take();
@@ -191,10 +191,10 @@ fn besieged(secured: bool) {
 
 #[test]
 fn honest_letters_are_delivered_by_an_attacked_gateway_with_keys() {
-    besieged(true);
+    under_load(true);
 }
 
 #[test]
 fn honest_letters_are_delivered_by_an_attacked_gateway_without_keys() {
-    besieged(false);
+    under_load(false);
 }
