@@ -32,7 +32,7 @@ const GOALS: usize = 200;
 /// Time in which nothing happens.
 const IDLE: Duration = Duration::from_secs(10);
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 #[derive(Serialize, Deserialize)]
 struct Pose {
@@ -131,7 +131,7 @@ async fn ask(rover: &Agent) {
         .ontology("bare")
         .language("fipa-sl")
         .content("x".repeat(140));
-    let mut request = rover.request(request, PATIENCE).await.unwrap();
+    let mut request = rover.request(request, TIMEOUT).await.unwrap();
     request.agreed().await.unwrap();
     request.result().await.unwrap();
 }

@@ -339,15 +339,15 @@ impl Agent {
             .await
     }
 
-    /// Waits for the next message for this agent; returns `None` if none arrives within `patience`.
+    /// Waits for the next message for this agent; returns `None` if none arrives within `timeout`.
     ///
     /// # Errors
     /// See [`receive`](Self::receive).
     pub async fn receive_within(
         &self,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Option<Incoming>, ReceiveError> {
-        match tokio::time::timeout(patience, self.receive()).await {
+        match tokio::time::timeout(timeout, self.receive()).await {
             Ok(received) => received.map(Some),
             Err(_) => Ok(None),
         }

@@ -306,13 +306,13 @@ impl Domain {
 }
 
 impl Changes {
-    /// Waits for the next change; returns `None` if there is none within `patience`, or if the iterator
+    /// Waits for the next change; returns `None` if there is none within `timeout`, or if the iterator
     /// has ended.
-    pub fn next_within(&mut self, patience: Duration) -> Option<Change> {
+    pub fn next_within(&mut self, timeout: Duration) -> Option<Change> {
         let changes = &mut self.changes;
         let next = self
             .runtime
-            .block_on(async { tokio::time::timeout(patience, changes.next()).await });
+            .block_on(async { tokio::time::timeout(timeout, changes.next()).await });
         next.ok().flatten()
     }
 }
@@ -454,12 +454,12 @@ impl Agent {
         self.runtime.block_on(self.agent.receive())
     }
 
-    /// Waits for the next message for this agent; returns `None` if none arrives within `patience`.
+    /// Waits for the next message for this agent; returns `None` if none arrives within `timeout`.
     ///
     /// # Errors
     /// See [`crate::Agent::receive`].
-    pub fn receive_within(&self, patience: Duration) -> Result<Option<Incoming>, ReceiveError> {
-        self.runtime.block_on(self.agent.receive_within(patience))
+    pub fn receive_within(&self, timeout: Duration) -> Result<Option<Incoming>, ReceiveError> {
+        self.runtime.block_on(self.agent.receive_within(timeout))
     }
 
     /// Returns the next message for this agent, if one is available now; see

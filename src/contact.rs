@@ -93,12 +93,12 @@ pub(crate) const MAX_ADDRESSES: usize = Entry::MAX_LOCATIONS;
 ///
 /// # Errors
 /// If the identifier has no address, an address is not usable, the gateway cannot be asked within
-/// `patience`, or it refuses, for example because a directory lists another agent of this name.
+/// `timeout`, or it refuses, for example because a directory lists another agent of this name.
 pub async fn introduce(
     agent: &Agent,
     gateway: &Entry,
     id: &AgentId,
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<(), IntroduceError> {
     let addresses = id.addresses().iter().take(MAX_ADDRESSES);
     let mut addresses: Vec<String> = addresses.map(|it| (**it).to_owned()).collect();
@@ -120,7 +120,7 @@ pub async fn introduce(
     };
     let content = serde_json::to_string(&introduction)
         .map_err(|error| AskError::NotUnderstood(error.to_string()))?;
-    let answer = routes::ask(agent, gateway, (ONTOLOGY, Some(content)), patience).await?;
+    let answer = routes::ask(agent, gateway, (ONTOLOGY, Some(content)), timeout).await?;
     match *answer.performative() {
         Performative::Inform => {
             agent.domain().inner.introductions.accepted(id);

@@ -43,14 +43,14 @@
 //! # use std::time::Duration;
 //! # use fipa::Performative::{Cfp, Request};
 //! # async fn example(rover: fipa::Agent) -> fipa::Result<()> {
-//! let patience = Duration::from_secs(30);
+//! let timeout = Duration::from_secs(30);
 //! let lift = rover.message(Request).receiver("arm_1").content("(lift crate)");
-//! println!("{}", rover.request(lift, patience).await?.result().await?.text());
+//! println!("{}", rover.request(lift, timeout).await?.result().await?.text());
 //!
 //! let carry = rover.message(Cfp).content("(carry crate)");
-//! let mut net = rover.contract_net(carry, &["arm_.*"], patience).await?;
+//! let mut net = rover.contract_net(carry, &["arm_.*"], timeout).await?;
 //! let best = net.bids().proposals.first().cloned();
-//! println!("{:?}", net.award(best.as_slice(), "", patience).await?);
+//! println!("{:?}", net.award(best.as_slice(), "", timeout).await?);
 //! # Ok(())
 //! # }
 //! ```

@@ -369,7 +369,7 @@ impl Server {
     }
 
     /// Returns the time for an answer: the deadlines of the request and of the answer.
-    fn patience(&self) -> Duration {
+    fn timeout(&self) -> Duration {
         self.core.endpoint.domain.inner.deadline * 2
     }
 
@@ -390,13 +390,13 @@ impl Server {
     async fn request(&self, function: &Function) -> Result<Message, PlatformError> {
         let content = function.content(&self.id)?;
         let request = self.message(Performative::Request, "fipa-sl0", content);
-        let begun = Request::begin(&self.core, "fipa-request", request, self.patience());
+        let begun = Request::begin(&self.core, "fipa-request", request, self.timeout());
         Ok(begun.await?.result().await?)
     }
 
     async fn subscribe(&self, template: &AgentDescription) -> Result<Subscription, PlatformError> {
         let content = subscription(&self.id, template)?;
         let message = self.message(Performative::Subscribe, "fipa-sl2", content);
-        Ok(Subscription::begin(&self.core, message, self.patience()).await?)
+        Ok(Subscription::begin(&self.core, message, self.timeout()).await?)
     }
 }

@@ -194,15 +194,15 @@ pub enum AskError {
 /// use an agent that serves no other purpose.
 ///
 /// # Errors
-/// If the request cannot be sent or delivered, or if no report arrives within `patience`.
+/// If the request cannot be sent or delivered, or if no report arrives within `timeout`.
 pub async fn of_gateway(
     agent: &Agent,
     gateway: &Entry,
     receivers: Option<&str>,
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<Report, AskError> {
     let request = (ONTOLOGY, receivers.map(str::to_owned));
-    let answer = ask(agent, gateway, request, patience).await?;
+    let answer = ask(agent, gateway, request, timeout).await?;
     let content = answer.content().map(|bytes| &bytes[..]).unwrap_or_default();
     if *answer.performative() != Performative::Inform {
         let text = String::from_utf8_lossy(content).into_owned();
@@ -216,7 +216,7 @@ pub(crate) async fn ask(
     agent: &Agent,
     gateway: &Entry,
     (ontology, content): (&str, Option<String>),
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<Message, AskError> {
     let reference = Incarnation::random().to_string();
     let receiver =
@@ -229,7 +229,7 @@ pub(crate) async fn ask(
     if let Some(content) = content {
         request = request.content(content);
     }
-    let deliveries = agent.send_within(request.build()?, patience).await?;
+    let deliveries = agent.send_within(request.build()?, timeout).await?;
     if !deliveries.all_succeeded() {
         return Err(AskError::NotDelivered(deliveries));
     }
@@ -241,8 +241,8 @@ pub(crate) async fn ask(
             }
         }
     };
-    let answer = tokio::time::timeout(patience, answer);
-    Ok(answer.await.map_err(|_| AskError::Silence(patience))??)
+    let answer = tokio::time::timeout(timeout, answer);
+    Ok(answer.await.map_err(|_| AskError::Silence(timeout))??)
 }
 
 impl From<fipa_mts::core::PeerState> for StaticPeer {

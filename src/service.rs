@@ -30,7 +30,7 @@ use crate::watch::Watchers;
 const KEEP_ALIVE: Duration = Duration::from_secs(2);
 
 /// Time that a closing service waits for letters in transit.
-pub(crate) const CLOSING_PATIENCE: Duration = Duration::from_secs(1);
+pub(crate) const CLOSING_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// A message transport service in one of its two roles.
 pub(crate) struct Service {
@@ -271,9 +271,9 @@ impl Service {
         self.mts.reorder(order, routes, config.mts.deadline);
     }
 
-    /// Waits for letters in transit, at most [`CLOSING_PATIENCE`], and ends the service.
+    /// Waits for letters in transit, at most [`CLOSING_TIMEOUT`], and ends the service.
     pub(crate) async fn close(&self) {
-        self.mts.close(CLOSING_PATIENCE).await;
+        self.mts.close(CLOSING_TIMEOUT).await;
         log_limit::report_omitted();
         self.abort();
     }

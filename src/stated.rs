@@ -22,7 +22,7 @@ use tokio::sync::oneshot;
 use crate::{Domain, RegisterOptions, contact, routes};
 
 /// Maximum time for the answer of the gateway to an introduction. It may resolve host names.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Maximum number of letters of an agent that wait for introductions.
 const MAX_WAITING: usize = 1024;
@@ -133,20 +133,20 @@ impl Introductions {
         &self,
         domain: &Domain,
         id: &AgentId,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<(), Arc<str>> {
         let key = Key::of(id);
         if let Some(why) = self.refusal(Instant::now(), &key) {
             return Err(why);
         }
-        let asked = ask(domain, id, patience.min(PATIENCE)).await;
+        let asked = ask(domain, id, timeout.min(TIMEOUT)).await;
         let asked = asked.map_err(Arc::from);
         self.remember(Instant::now(), key, &asked);
         asked
     }
 }
 
-async fn ask(domain: &Domain, id: &AgentId, patience: Duration) -> Result<(), String> {
+async fn ask(domain: &Domain, id: &AgentId, timeout: Duration) -> Result<(), String> {
     let entries = domain.inner.service.host.entries();
     let is_own = |entry: &&Arc<Entry>| entry.role == Role::Gateway && entry.reach == Reach::Local;
     let Some(gateway) = entries.iter().find(is_own) else {
@@ -163,7 +163,7 @@ async fn ask(domain: &Domain, id: &AgentId, patience: Duration) -> Result<(), St
     let name = format!("fipa-contact-{}", Incarnation::random());
     let asker = domain.register_with(&name, options).await;
     let asker = asker.map_err(|error| ErrorChain(&error).to_string())?;
-    let introduced = contact::introduce(&asker, gateway, id, patience).await;
+    let introduced = contact::introduce(&asker, gateway, id, timeout).await;
     introduced.map_err(|error| match error {
         contact::IntroduceError::Refused(why) => why,
         other => ErrorChain(&other).to_string(),

@@ -16,7 +16,7 @@ use fipa::{Agent, AgentId, Config, Domain, Performative, SendError};
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
 
 /// A deadline that a passing test does not reach.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 // ANCHOR: handler
 async fn lift(mut task: Task) -> std::result::Result<Reply, DialogueError> {
@@ -198,7 +198,7 @@ async fn an_own_protocol_is_followed() -> Result<()> {
     assert!(matches!(refused, Err(SendError::Violation(_))));
     // ANCHOR_END: own_violation
     let passed = rover.reply(&opened, Performative::Confirm).build()?;
-    let deliveries = rover.send_within(passed, PATIENCE).await?;
+    let deliveries = rover.send_within(passed, TIMEOUT).await?;
     assert!(deliveries.all_succeeded(), "{deliveries}");
     domain.close().await;
     Ok(())

@@ -323,8 +323,8 @@ async fn the_gateway_reports_the_routes_of_letters_and_their_state() {
     }
     let asker = at_home.register(&here.name("asker")).await.unwrap();
     let gateway = at_home.directory().lookup(near.name()).unwrap();
-    let patience = Duration::from_secs(30);
-    let ask = || routes::of_gateway(&asker, &gateway, Some(arm.name()), patience);
+    let timeout = Duration::from_secs(30);
+    let ask = || routes::of_gateway(&asker, &gateway, Some(arm.name()), timeout);
 
     let report = ask().await.unwrap();
     assert_eq!(report.incarnation, near.incarnation());
@@ -493,7 +493,7 @@ async fn ends_with_custody(near_ends: bool) -> FailureReason {
     // The queue of the receiver is full, and no task reads it.
     let second = rover.send(inform(&rover, arm.name(), "2"));
     let ending = async {
-        let patience = Duration::from_secs(60);
+        let timeout = Duration::from_secs(60);
         let is_refused = |ways: &[RouteState]| {
             let mut local = ways
                 .iter()
@@ -501,7 +501,7 @@ async fn ends_with_custody(near_ends: bool) -> FailureReason {
             local.any(|way| way.turned_back > 0)
         };
         loop {
-            let report = routes::of_gateway(&asker, &entry, None, patience).await;
+            let report = routes::of_gateway(&asker, &entry, None, timeout).await;
             if is_refused(&report.unwrap().ways) {
                 break;
             }

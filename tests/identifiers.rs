@@ -14,7 +14,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
 
 /// Ends a test that hangs.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A host with a gateway that uses HTTP.
 async fn host(settings: &[&str]) -> (Gateway, Domain, String) {
@@ -55,7 +55,7 @@ impl Platform {
     async fn read(&self, count: usize) -> Vec<Message> {
         let mut messages = Vec::new();
         while messages.len() < count {
-            let (mut stream, _) = timeout(PATIENCE, self.0.accept()).await.unwrap().unwrap();
+            let (mut stream, _) = timeout(TIMEOUT, self.0.accept()).await.unwrap().unwrap();
             let mut bytes = Vec::new();
             while messages.len() < count {
                 let Some(len) = request_len(&bytes) else {
@@ -212,7 +212,7 @@ async fn a_received_identifier_dials_only_what_is_permitted() {
     let sent = send(&rover, at("arm", &[&third.address()]), "for arm").await;
     assert!(sent.all_succeeded(), "{sent}");
     for _ in 0..2 {
-        let received = timeout(PATIENCE, arm.receive()).await.unwrap().unwrap();
+        let received = timeout(TIMEOUT, arm.receive()).await.unwrap().unwrap();
         assert_eq!(received.content().unwrap(), "for arm");
     }
     assert!(!third.was_dialed().await);
@@ -259,7 +259,7 @@ async fn answers_go_to_a_reply_to_of_the_same_platform_only() {
     };
     let answer = async |message: &str| {
         post(message, "arm", &http).await;
-        let received = timeout(PATIENCE, arm.receive()).await.unwrap().unwrap();
+        let received = timeout(TIMEOUT, arm.receive()).await.unwrap().unwrap();
         let answer = arm.reply(received.message(), Performative::Inform);
         arm.send(answer.content("done")).await.unwrap()
     };
@@ -315,7 +315,7 @@ async fn a_directory_facilitator_at_an_address_is_asked() {
     let rover = domain.register("rover").await.unwrap();
     let df = rover.df_of(at("df@jade", &[&platform.address()]));
     let any = fipa::platform::AgentDescription::default();
-    let search = timeout(PATIENCE, df.search(&any));
+    let search = timeout(TIMEOUT, df.search(&any));
     let read = async {
         let read = platform.read(1).await;
         assert_eq!(read[0].receivers()[0].name(), "df@jade");

@@ -21,7 +21,7 @@ use futures_core::Stream;
 use support::{inform, two};
 
 /// Longer than any step takes, also on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Makes a configuration for a domain that no other test uses, with a deadline for busy machines.
 fn config(set: &[&str]) -> Config {
@@ -35,12 +35,12 @@ async fn a_message_is_sent_by_its_builder_and_a_bad_name_is_an_error_of_send() {
     let arm = domain.register("arm_1").await.unwrap();
     let lift = rover.message(Request).receiver("arm_1").content(" 2.5\n");
     assert!(rover.send(lift).await.unwrap().all_succeeded());
-    let letter = arm.receive_within(PATIENCE).await.unwrap().unwrap();
+    let letter = arm.receive_within(TIMEOUT).await.unwrap().unwrap();
     assert_eq!(letter.message().text(), " 2.5\n");
     assert_eq!(letter.message().parse::<f64>().unwrap(), 2.5);
     let answer = arm.reply(letter.message(), Inform).content("done");
     assert!(
-        arm.send_within(answer, PATIENCE)
+        arm.send_within(answer, TIMEOUT)
             .await
             .unwrap()
             .all_succeeded()
@@ -119,7 +119,7 @@ async fn deregister_ends_a_waiting_receive() {
     })
     .await;
     arm.deregister().unwrap();
-    let ended = tokio::time::timeout(PATIENCE, received).await.unwrap();
+    let ended = tokio::time::timeout(TIMEOUT, received).await.unwrap();
     assert!(matches!(ended, Err(ReceiveError::Closed)));
 }
 
@@ -154,7 +154,7 @@ async fn each_message_goes_to_one_of_two_receive_calls() {
     }
     let mut all = Vec::new();
     for reader in readers {
-        let read = tokio::time::timeout(PATIENCE, reader)
+        let read = tokio::time::timeout(TIMEOUT, reader)
             .await
             .unwrap()
             .unwrap();
@@ -197,7 +197,7 @@ async fn agents_are_listed_by_type_and_their_changes_are_a_stream() {
     let mut left = BTreeSet::new();
     while left.len() < 3 {
         let next = poll_fn(|context| Pin::new(&mut changes).poll_next(context));
-        let change = tokio::time::timeout(PATIENCE, next).await.unwrap();
+        let change = tokio::time::timeout(TIMEOUT, next).await.unwrap();
         for one in change.unwrap().single() {
             if let Change::Left(entry) = one {
                 left.insert(entry.name.to_string());
@@ -209,7 +209,7 @@ async fn agents_are_listed_by_type_and_their_changes_are_a_stream() {
     drop(rover);
     here.close().await;
     let end = async { while changes.next().await.is_some() {} };
-    tokio::time::timeout(PATIENCE, end).await.unwrap();
+    tokio::time::timeout(TIMEOUT, end).await.unwrap();
 }
 
 #[test]
@@ -308,7 +308,7 @@ fn converse(config: &Config) {
     assert_ne!(rover.unique_id(), rover.unique_id());
     assert_eq!(rover.domain().agents_of_type("arm").len(), 1);
     assert_eq!(domain.agents().len(), 2);
-    let joined = std::iter::from_fn(|| changes.next_within(PATIENCE)).find_map(|it| match it {
+    let joined = std::iter::from_fn(|| changes.next_within(TIMEOUT)).find_map(|it| match it {
         Change::Joined(entry) if &*entry.name == "arm" => Some(entry.incarnation),
         _ => None,
     });
@@ -331,11 +331,11 @@ fn converse(config: &Config) {
     for _ in 0..300 {
         let sent = rover.send(rover.message(Inform).receiver("rover"));
         assert!(sent.unwrap().all_succeeded());
-        assert!(rover.receive_within(PATIENCE).unwrap().is_some());
+        assert!(rover.receive_within(TIMEOUT).unwrap().is_some());
     }
     let lift = rover.message(Request).receiver(group.name()).content("x");
     assert!(rover.send(lift).unwrap().all_succeeded());
-    let answer = rover.receive_within(PATIENCE).unwrap().unwrap();
+    let answer = rover.receive_within(TIMEOUT).unwrap().unwrap();
     assert_eq!(answer.message().text(), "done");
     assert!(echo.join().unwrap().all_succeeded());
     drop(group);

@@ -19,7 +19,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
 
 /// Ends a test that hangs.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 macro_rules! recorded {
     ($($file:literal),* $(,)?) => {
@@ -55,7 +55,7 @@ impl Host {
                 changes.next().await.unwrap();
             }
         };
-        timeout(PATIENCE, known).await.unwrap();
+        timeout(TIMEOUT, known).await.unwrap();
         Self {
             gateway,
             domain,
@@ -77,7 +77,7 @@ impl Host {
             stream.read_to_end(&mut letter).await.unwrap();
             letter
         };
-        timeout(PATIENCE, read).await.unwrap()
+        timeout(TIMEOUT, read).await.unwrap()
     }
 }
 
@@ -89,7 +89,7 @@ async fn send_as_peer(letter: &[u8], at: &str) {
 }
 
 async fn receive(agent: &Agent) -> Message {
-    let received = timeout(PATIENCE, agent.receive()).await;
+    let received = timeout(TIMEOUT, agent.receive()).await;
     received.unwrap().unwrap().into_message()
 }
 
@@ -135,7 +135,7 @@ async fn letters_of_fipa_services_are_received_and_answered_in_its_dialect() {
             let answer = agent.reply(&message, Performative::Agree).content(file);
             let (delivered, answer) = tokio::join!(
                 agent.send(answer.build().unwrap()),
-                timeout(PATIENCE, host.read_by_peer())
+                timeout(TIMEOUT, host.read_by_peer())
             );
             let delivered = delivered.unwrap();
             let outcome = &delivered.0[0].outcome;
@@ -171,8 +171,8 @@ async fn a_letter_that_fipa_services_cannot_decode_fails_at_once_with_the_reason
     ];
     for (from, message) in letters {
         // The test ends long before this deadline, or fails.
-        let sent = from.send_within(message, 10 * PATIENCE);
-        let deliveries = timeout(PATIENCE, sent).await.unwrap().unwrap();
+        let sent = from.send_within(message, 10 * TIMEOUT);
+        let deliveries = timeout(TIMEOUT, sent).await.unwrap().unwrap();
         match &deliveries.0[0].outcome {
             Outcome::Failed { reason, attempts } => {
                 assert_eq!(*reason, FailureReason::Inexpressible, "{deliveries}");
@@ -271,7 +271,7 @@ async fn an_unannounced_agent_is_answered_in_its_dialect_for_all_encodings() {
         let asked = receive(&bob).await;
         let answer = bob.reply(&asked, Performative::Agree).build().unwrap();
         let (delivered, answer) =
-            tokio::join!(bob.send(answer), timeout(PATIENCE, host.read_by_peer()));
+            tokio::join!(bob.send(answer), timeout(TIMEOUT, host.read_by_peer()));
         assert!(delivered.unwrap().all_succeeded());
         let (_, letter, message) = read(&answer.unwrap());
         let theirs = message.encode(BitEfficient, Dialect::FipaServices);
@@ -280,7 +280,7 @@ async fn an_unannounced_agent_is_answered_in_its_dialect_for_all_encodings() {
         let stranger = format!("dave-{number}");
         let lost = letter_to("unknown", &stranger, &at, encoded);
         send_as_peer(&lost, &host.address()).await;
-        let (_, letter, failure) = read(&timeout(PATIENCE, host.read_by_peer()).await.unwrap());
+        let (_, letter, failure) = read(&timeout(TIMEOUT, host.read_by_peer()).await.unwrap());
         assert_eq!(*failure.performative(), Performative::Failure);
         assert_eq!(failure.receivers()[0].name(), stranger);
         let theirs = failure.encode(BitEfficient, Dialect::FipaServices);
@@ -302,7 +302,7 @@ async fn an_unannounced_agent_is_answered_at_the_address_in_its_letter() {
     let answer = bob.reply(&asked, Performative::Agree).content("done");
     let (delivered, answer) = tokio::join!(
         bob.send(answer.build().unwrap()),
-        timeout(PATIENCE, host.read_by_peer())
+        timeout(TIMEOUT, host.read_by_peer())
     );
     let delivered = delivered.unwrap();
     let handed = matches!(delivered.0[0].outcome, Outcome::Sent { via: Kind::Tcp, .. });
@@ -518,7 +518,7 @@ async fn a_call_for_proposals_does_not_wait_for_an_agent_that_a_legacy_peer_does
     let forever = Duration::from_secs(3600);
     let cfp = rover.message(Performative::Cfp).content("carry");
     let call = rover.contract_net(cfp, &["echo@jadetest"], forever);
-    let (net, ()) = tokio::join!(timeout(PATIENCE, call), peer(Performative::Cfp));
+    let (net, ()) = tokio::join!(timeout(TIMEOUT, call), peer(Performative::Cfp));
     let net = net.unwrap().unwrap();
     assert_eq!(net.bids().silent, ["echo@jadetest"]);
     assert_eq!(net.bids().unreached, ["echo@jadetest"]);
@@ -542,11 +542,11 @@ async fn a_call_for_proposals_does_not_wait_for_an_agent_that_a_legacy_peer_does
         let letter = letter_of_jade_to(to, "echo@jadetest", &bid);
         send_as_peer(&letter, &host.address()).await;
     };
-    let (net, ()) = tokio::join!(timeout(PATIENCE, call), proposes);
+    let (net, ()) = tokio::join!(timeout(TIMEOUT, call), proposes);
     let mut net = net.unwrap().unwrap();
     let bids = net.bids().proposals.clone();
     assert_eq!(bids.len(), 1);
-    let award = timeout(PATIENCE, net.award(&bids, "", forever));
+    let award = timeout(TIMEOUT, net.award(&bids, "", forever));
     let (awarded, ()) = tokio::join!(award, peer(Performative::AcceptProposal));
     let awarded = awarded.unwrap().unwrap();
     let lost = matches!(

@@ -10,7 +10,7 @@ use std::time::Duration;
 use fipa::{Kind, Outcome};
 use fipa_mts::core::Submission;
 use fipa_transport::Incarnation;
-use tokio::time::timeout;
+use tokio::time;
 
 use services::{ARM, TestService, host, letter, number};
 
@@ -59,7 +59,7 @@ async fn beyond_max_clients_letters_take_the_next_route() {
     left.mts.close(Duration::from_secs(1)).await;
     drop(left);
     let (last, rover) = senders.pop().unwrap();
-    let patience = async {
+    let timeout = async {
         for attempt in 100.. {
             let outcome = send((&last, rover), &arms, attempt).await;
             if matches!(outcome, Outcome::Delivered { via: Kind::Shm, .. }) {
@@ -68,7 +68,9 @@ async fn beyond_max_clients_letters_take_the_next_route() {
             assert!(outcome.is_success(), "{outcome}");
         }
     };
-    timeout(Duration::from_secs(60), patience).await.unwrap();
+    time::timeout(Duration::from_secs(60), timeout)
+        .await
+        .unwrap();
 }
 
 /// Sends a letter with this number and receives it.
@@ -83,7 +85,7 @@ async fn send(
         receivers: vec!["arm".into()],
         deadline: Duration::from_secs(20),
     });
-    let received = timeout(Duration::from_secs(60), to.mts.receive(ARM)).await;
+    let received = time::timeout(Duration::from_secs(60), to.mts.receive(ARM)).await;
     assert_eq!(number(&received.unwrap().unwrap().letter), sequence);
     sending.outcomes().await.remove(0).1
 }

@@ -18,7 +18,7 @@ use fipa_transport::Incarnation;
 use stranger::Stranger;
 
 /// Time limit of all waits, which a passing test does not reach.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 fn config(set: &[&str]) -> Config {
     support::config(&[&["mts.deadline=30s"], set].concat())
@@ -68,7 +68,7 @@ fn names<'a>(ids: impl IntoIterator<Item = &'a Option<AgentId>>) -> Vec<String> 
 
 /// Waits for the next notification.
 async fn next(notifications: &mut fipa::platform::Notifications) -> Vec<AgentDescription> {
-    let next = tokio::time::timeout(PATIENCE, notifications.next()).await;
+    let next = tokio::time::timeout(TIMEOUT, notifications.next()).await;
     next.unwrap().unwrap()
 }
 
@@ -115,7 +115,7 @@ async fn services_are_registered_found_and_watched() {
     assert_eq!(names(gone.iter().map(|it| &it.name)), ["crane"]);
     assert!(gone[0].services.is_empty());
     assert!(df.search(&lifting()).await.unwrap().is_empty());
-    notifications.cancel(PATIENCE).await.unwrap();
+    notifications.cancel(TIMEOUT).await.unwrap();
     domain.close().await;
     gateway.close().await;
 }
@@ -176,7 +176,7 @@ async fn an_agent_of_another_host_registers_itself_for_a_time() {
     let registered = facilitator.register_service(service).await.unwrap();
     let ends = registered.lease_time.unwrap().to_system_time(before);
     let lease = ends.duration_since(before).unwrap();
-    assert!(lease <= limits::LEASE + PATIENCE, "{lease:?}");
+    assert!(lease <= limits::LEASE + TIMEOUT, "{lease:?}");
     let found = rover.df().unwrap().search(&lifting()).await.unwrap();
     assert_eq!(found, [registered]);
     // The agent management system lists it for agents of its platform only.
@@ -225,7 +225,7 @@ async fn finds(df: &Df<'_>, expected: &[&str]) {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    let ended = tokio::time::timeout(PATIENCE, wait).await;
+    let ended = tokio::time::timeout(TIMEOUT, wait).await;
     assert!(ended.is_ok(), "{found:?} instead of {expected:?}");
 }
 
@@ -483,7 +483,7 @@ async fn gateways_with_one_name_keep_it_and_reach_each_other_by_second_names() {
     assert!(registered.lease_time.is_some());
     let noticed = next(&mut notifications).await;
     assert_eq!(names(noticed.iter().map(|it| &it.name)), ["other"]);
-    notifications.cancel(PATIENCE).await.unwrap();
+    notifications.cancel(TIMEOUT).await.unwrap();
     let second = second_names(&at_home, "ams", near.name(), true).remove(0);
     let there = other.ams_of(AgentId::new(second).unwrap());
     let description = there.description().await.unwrap();
@@ -521,7 +521,7 @@ async fn announce(stranger: &mut Stranger, gateway: &Gateway, names: &[String], 
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, known).await.unwrap();
+    tokio::time::timeout(TIMEOUT, known).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -621,7 +621,7 @@ async fn no_process_and_no_other_platform_takes_the_name_of_a_gateways_agent() {
     for (name, is_reserved) in [(format!("df@{own}"), true), ("df@jade".to_owned(), false)] {
         let id = AgentId::new(&*name).unwrap();
         let id = id.with_address("tcp://127.0.0.1:9;fipa-services").unwrap();
-        let introduced = fipa::contact::introduce(&rover, &entry, &id, PATIENCE).await;
+        let introduced = fipa::contact::introduce(&rover, &entry, &id, TIMEOUT).await;
         match introduced {
             Ok(()) => assert!(!is_reserved, "{name}"),
             Err(error) => {
@@ -670,7 +670,7 @@ fn a_process_without_a_runtime_uses_the_same_calls() {
     assert_eq!(df.search(&lifting()).unwrap().len(), 1);
     df.deregister().unwrap();
     assert!(notifications.next().unwrap()[0].services.is_empty());
-    notifications.cancel(PATIENCE).unwrap();
+    notifications.cancel(TIMEOUT).unwrap();
     let ams = rover.ams().unwrap();
     assert_eq!(ams.description().unwrap().name, gateway.name());
     drop((crane, rover));

@@ -14,7 +14,7 @@ use fipa_testbed::until_async;
 use support::{config, inform, mark};
 
 /// Time limit of all waits, which a passing test does not reach.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Number and length of the letters, of which only some fit into the receiver's queue and the custody of
 /// its gateway.
@@ -40,7 +40,7 @@ async fn knows(domain: &Domain, name: &str) {
 async fn turned_back(asker: &Agent, gateway: &Gateway, times: u64) {
     let gateway = gateway.directory().known(gateway.name()).unwrap();
     loop {
-        let report = routes::of_gateway(asker, &gateway, None, PATIENCE).await;
+        let report = routes::of_gateway(asker, &gateway, None, TIMEOUT).await;
         let ways = report.unwrap().ways;
         let abroad = ways.iter().filter(|way| way.location.kind() == Kind::Tcp);
         if abroad.map(|way| way.turned_back).sum::<u64>() >= times {

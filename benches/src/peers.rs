@@ -17,13 +17,13 @@ use crate::error::{BenchError, chain_text};
 const TURNS: usize = 10;
 
 /// Maximum time for a reply of the echo agent; a later one counts as lost.
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Maximum time for the replies to a turn of the other platform.
-const TURN_PATIENCE: Duration = Duration::from_secs(600);
+const TURN_TIMEOUT: Duration = Duration::from_secs(600);
 
 /// Time after the last conversation in which further replies are counted.
-const SURPLUS_PATIENCE: Duration = Duration::from_secs(1);
+const SURPLUS_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Conversations with an agent of a JADE platform.
 #[derive(Debug)]
@@ -141,7 +141,7 @@ impl Peers {
 }
 
 async fn introduce(agent: &Agent, gateway: &Entry, id: &AgentId) -> Result<(), BenchError> {
-    let introduced = contact::introduce(agent, gateway, id, PATIENCE).await;
+    let introduced = contact::introduce(agent, gateway, id, TIMEOUT).await;
     introduced.map_err(|source: IntroduceError| BenchError::Peer {
         agent: id.name().to_owned(),
         what: chain_text(source),
@@ -190,7 +190,7 @@ impl<'a> Side<'a> {
         let (request, reference) = self.request(echo, "x".repeat(size))?;
         let began = Instant::now();
         let sent = self.agent.send(request);
-        let (sent, reply) = tokio::join!(sent, self.reply(echo, &reference, PATIENCE));
+        let (sent, reply) = tokio::join!(sent, self.reply(echo, &reference, TIMEOUT));
         let deliveries = sent.map_err(|error| failed(echo, error))?;
         match reply? {
             Some((reply, at)) if reply.content().is_some_and(|it| it.len() == size) => {
@@ -225,8 +225,8 @@ impl<'a> Side<'a> {
         if !deliveries.all_succeeded() {
             return Err(broken(deliveries.to_string()));
         }
-        let Some((reply, _)) = self.reply(asker, &reference, TURN_PATIENCE).await? else {
-            return Err(broken(format!("no reply within {TURN_PATIENCE:?}")));
+        let Some((reply, _)) = self.reply(asker, &reference, TURN_TIMEOUT).await? else {
+            return Err(broken(format!("no reply within {TURN_TIMEOUT:?}")));
         };
         let content = reply.content().map(|bytes| &bytes[..]).unwrap_or_default();
         let text = String::from_utf8_lossy(content);
@@ -247,9 +247,9 @@ impl<'a> Side<'a> {
         &mut self,
         from: &AgentId,
         reference: &str,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Option<(Message, Instant)>, BenchError> {
-        let until = tokio::time::Instant::now() + patience;
+        let until = tokio::time::Instant::now() + timeout;
         loop {
             let received = tokio::time::timeout_at(until, self.agent.receive()).await;
             let Ok(received) = received else {
@@ -274,7 +274,7 @@ impl<'a> Side<'a> {
     /// Counts the replies that are still arriving.
     async fn drain(&mut self) -> Result<(), BenchError> {
         let nobody = self.agent.id().clone();
-        self.reply(&nobody, "", SURPLUS_PATIENCE).await.map(drop)
+        self.reply(&nobody, "", SURPLUS_TIMEOUT).await.map(drop)
     }
 }
 

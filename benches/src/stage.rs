@@ -13,7 +13,7 @@ use crate::comparison::Program;
 use crate::part::{End, Event, Order, Part};
 
 /// Timeout of an answer, which usually takes less than a second.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Time that a process of zenoh has to end after its orders end. Only zenoh removes its files.
 const ENDING: Duration = Duration::from_millis(300);
@@ -228,8 +228,8 @@ impl Stage {
     pub(super) async fn event(&mut self, who: ProcessIndex) -> Result<Event, String> {
         let process = self.process(who)?;
         let name = &process.name;
-        let line = tokio::time::timeout(PATIENCE, process.events.next_line()).await;
-        let line = line.map_err(|_| format!("{name} sent no line for {PATIENCE:?}"))?;
+        let line = tokio::time::timeout(TIMEOUT, process.events.next_line()).await;
+        let line = line.map_err(|_| format!("{name} sent no line for {TIMEOUT:?}"))?;
         let line = line.map_err(|error| format!("{name}: {error}"))?;
         let line = line.ok_or_else(|| format!("{name} ended unexpectedly"))?;
         match serde_json::from_str(&line) {

@@ -22,7 +22,7 @@ use fipa_testbed::{ChildGuard, ignored_test, until};
 use serde_json::{Value, json};
 
 /// Longer than any step takes, also on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A text that controls a terminal and forges a line.
 const HOSTILE: &str = "x\u{1b}]0;t\u{7}\u{9b}31m\u{202e}\r\nerror: forged";
@@ -44,7 +44,7 @@ fn inside_agents() {
     for (name, price) in [("arm_1", "30"), ("arm_2", "10"), ("arm_3", "20")] {
         let arm = domain.register(name).unwrap();
         servers.push(arm.serve("fipa-request", act).unwrap());
-        let bid = move |mut task: Side<Task>| match task.propose(price, PATIENCE)? {
+        let bid = move |mut task: Side<Task>| match task.propose(price, TIMEOUT)? {
             true => Ok::<_, DialogueError>(Reply::Inform("carried".into())),
             false => {
                 mark(&format!("rejected-{name}"));
@@ -76,7 +76,7 @@ fn act(mut task: Side<Task>) -> Result<Reply, DialogueError> {
         "fail" => Ok(Reply::Failure("it fell".into())),
         "fail at length" => Ok(Reply::Failure(long_reason().into())),
         "wait" => {
-            if !task.cancelled(PATIENCE)? {
+            if !task.cancelled(TIMEOUT)? {
                 return Ok(Reply::Failure("no cancel".into()));
             }
             mark("canceled");

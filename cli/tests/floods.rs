@@ -15,7 +15,7 @@ use fipa::{AgentId, Config, Envelope, EnvelopeParams, Letter, Message, Performat
 use fipa_acl::AclRepresentation;
 
 /// Time limit of all waits, which a passing test does not reach.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Returns an unframed letter to an agent that does not exist.
 fn letter(number: usize) -> Vec<u8> {
@@ -98,10 +98,10 @@ fn a_sender_that_takes_no_answers_does_not_delay_the_answers_to_others() {
         question(&silent, number);
     }
     question(&honest, 7);
-    let answer = honest.receive_within(PATIENCE).unwrap();
+    let answer = honest.receive_within(TIMEOUT).unwrap();
     assert_eq!(answer.unwrap().message().text(), "7");
     for number in 0..QUESTIONS {
-        let answer = silent.receive_within(PATIENCE).unwrap();
+        let answer = silent.receive_within(TIMEOUT).unwrap();
         assert_eq!(answer.unwrap().message().text(), number.to_string());
     }
     // A killed process would leave its files in the directory of this user.

@@ -293,8 +293,8 @@ fn fuzz(secured: bool) {
     let before = settled(&setup.pair.gateway, calm);
     let tallies = setup.attack(seconds, seed);
     // Few letters pass on a busy machine.
-    let patience = Instant::now() + LONGER;
-    while setup.pair.strange() == 0 && Instant::now() < patience {
+    let timeout = Instant::now() + LONGER;
+    while setup.pair.strange() == 0 && Instant::now() < timeout {
         setup.attack(1, fastrand::u64(..));
     }
     let after = settled(&setup.pair.gateway, |usage| {

@@ -47,7 +47,7 @@ const FAILURE: &[u8] = recorded!("failure-unknown-agent.3-ams-failure-from-jade"
 /// Address of JADE when its answers were recorded.
 const RECORDED_AT: &str = "127.0.0.1:27778";
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 fn replaced(bytes: &[u8], from: &str, to: &str) -> Vec<u8> {
     let (from, mut rest, mut out) = (from.as_bytes(), bytes, Vec::new());
@@ -80,7 +80,7 @@ fn at(request: &[u8], addresses: &[(&str, &str)]) -> Vec<u8> {
 /// Sends a request as JADE does, and checks the answer.
 fn post(request: &[u8], to: &str) {
     let mut stream = TcpStream::connect(to).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
     stream.write_all(request).unwrap();
     let mut answer = [0; 15];
     stream.read_exact(&mut answer).unwrap();
@@ -90,7 +90,7 @@ fn post(request: &[u8], to: &str) {
 /// Reads a request, answers it as JADE does, and returns its message.
 fn accept(listener: &TcpListener) -> Message {
     listener.set_nonblocking(true).unwrap();
-    let until = Instant::now() + PATIENCE;
+    let until = Instant::now() + TIMEOUT;
     let mut stream = loop {
         match listener.accept() {
             Ok((stream, _)) => break stream,
@@ -99,7 +99,7 @@ fn accept(listener: &TcpListener) -> Message {
         thread::sleep(Duration::from_millis(1));
     };
     stream.set_nonblocking(false).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
     let mut bytes = Vec::new();
     let mut more = [0; 65536];
     let body = loop {

@@ -26,7 +26,7 @@ use serde_json::Value;
 const HTTP: u16 = 7778;
 
 /// Watchdog of all waits, which a passing test does not reach.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Environment variable with the domain of a robot process.
 const DOMAIN: &str = "FIPA_TEST_ROBOT_DOMAIN";
@@ -258,7 +258,7 @@ impl<'a> Jade<'a> {
             body.len()
         );
         let mut stream = self.host.enter(|| TcpStream::connect(gateway)).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream.set_read_timeout(Some(TIMEOUT)).unwrap();
         stream.write_all(request.as_bytes()).unwrap();
         let mut answer = [0; 15];
         stream.read_exact(&mut answer).unwrap();
@@ -275,7 +275,7 @@ impl<'a> Jade<'a> {
     }
 
     fn next(&self) -> Message {
-        self.received.recv_timeout(PATIENCE).unwrap()
+        self.received.recv_timeout(TIMEOUT).unwrap()
     }
 
     /// Waits for a notification that has this text.
@@ -294,7 +294,7 @@ impl<'a> Jade<'a> {
 
 /// Reads a request, answers it, and returns its message.
 fn accept(mut stream: TcpStream) -> Message {
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
     let mut bytes = Vec::new();
     let mut more = [0; 65536];
     let body = loop {

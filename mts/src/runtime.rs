@@ -614,11 +614,11 @@ impl Mts {
     }
 
     /// Closes the service: accepts no more letters of others, gives letters in transit up to
-    /// `patience` to finish, then abandons them and closes the transports. Letters in custody return
+    /// `timeout` to finish, then abandons them and closes the transports. Letters in custody return
     /// to the services that handed them over.
-    pub async fn close(&self, patience: Duration) {
+    pub async fn close(&self, timeout: Duration) {
         self.shared.lock().core.refuse_custody();
-        self.wait_while(patience, Core::has_open_letters).await;
+        self.wait_while(timeout, Core::has_open_letters).await;
         self.give_up();
         self.wait_while(LAST_REPORTS, Core::has_open_reports).await;
         self.abort();

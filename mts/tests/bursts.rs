@@ -32,7 +32,7 @@ const WORK: Duration = Duration::from_micros(10);
 /// Time from the arrival of a letter to its outcome on a path without load: each hop there and back, and the work.
 const ROUND_TRIP: Duration = Duration::from_micros(2 * (20 + 500 + 20) + 20 * 10);
 /// Time beyond it and beyond the queue.
-const PATIENCE: Duration = Duration::from_millis(20);
+const TIMEOUT: Duration = Duration::from_millis(20);
 /// Maximum pause between two letters that are taken under steady load.
 const LONGEST_GAP: Duration = Duration::from_millis(50);
 
@@ -493,7 +493,7 @@ fn travel(from: usize, to: usize) -> Duration {
 fn check(path: &Path, letters: u32, queue: Duration) {
     assert_eq!(path.outcomes.len(), letters as usize);
     let slowest = path.slowest_outcome();
-    assert!(slowest <= ROUND_TRIP + queue + PATIENCE, "{slowest:?}");
+    assert!(slowest <= ROUND_TRIP + queue + TIMEOUT, "{slowest:?}");
 }
 
 #[test]

@@ -22,7 +22,7 @@ use fipa_transport::{
 };
 use parking_lot::Mutex;
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 const OWN: Incarnation = Incarnation::from_u64(1);
 /// Agents of another process of this host.
 const AGENTS: u64 = 40;
@@ -59,7 +59,7 @@ impl Contacts for Publishing {
             let received = service.try_receive(OWN).is_some();
             let _ = ended.send(received);
         });
-        let waited = end.recv_timeout(PATIENCE);
+        let waited = end.recv_timeout(TIMEOUT);
         waited.expect("the service is locked while contacts are published");
         self.events.lock().push(Event::Published);
     }
@@ -128,7 +128,7 @@ impl Gateway {
         });
         let config = RuntimeConfig {
             spin: Duration::ZERO,
-            unframed_deadline: PATIENCE,
+            unframed_deadline: TIMEOUT,
             contacts: Some(contacts.clone()),
             tap: None,
             gate: None,
@@ -174,7 +174,7 @@ impl Gateway {
                 sequence: 1,
                 after: 0,
                 transfer: 1,
-                remaining: PATIENCE,
+                remaining: TIMEOUT,
                 body: Body::Letter(letter(name, &["arm_0".to_owned()])),
             },
             from: Hop {

@@ -587,7 +587,7 @@ fn a_report_that_is_refused_is_repeated() {
 
 /// Letter 2 came back to the gateway because letter 1 is missing. Returns the time for which the
 /// gateway waits for letter 1 until it returns letter 2.
-fn patience(gateway: &mut Service, began: u64) -> u64 {
+fn timeout(gateway: &mut Service, began: u64) -> u64 {
     let letter = Parcel {
         after: 100,
         ..parcel(101, 900, Body::Letter(letter()))
@@ -604,7 +604,7 @@ fn patience(gateway: &mut Service, began: u64) -> u64 {
 #[test]
 fn predecessors_have_two_round_trips_to_arrive() {
     let mut gateway = Service::new(true);
-    assert_eq!(patience(&mut gateway, 0), 50);
+    assert_eq!(timeout(&mut gateway, 0), 50);
     // A service that takes 200 ms to acknowledge a report.
     let mut gateway = Service::new(true);
     gateway.arrive(0, 5, 70);
@@ -612,7 +612,7 @@ fn predecessors_have_two_round_trips_to_arrive() {
     gateway.answer(0, attempt, Answer::Accepted);
     let (report, _) = gateway.dispatched().unwrap();
     gateway.answer(200, report, Answer::Accepted);
-    assert_eq!(patience(&mut gateway, 1000), 400);
+    assert_eq!(timeout(&mut gateway, 1000), 400);
 }
 
 /// With a wait for each of them, letters of a long lane would come back slower than their sender sends

@@ -20,7 +20,7 @@ use parking_lot::Mutex;
 
 use self::common::Silent;
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Stops in the middle of a call until the test continues it.
 struct Halting {
@@ -41,7 +41,7 @@ impl Contacts for Halting {
 
     fn introduced(&self, _: &Introduction) {
         let _ = self.called.lock().send(());
-        let _ = self.go_on.lock().recv_timeout(PATIENCE);
+        let _ = self.go_on.lock().recv_timeout(TIMEOUT);
     }
 
     fn parted(&self, _: &Introduction) {}
@@ -97,10 +97,10 @@ fn no_transport_is_closed_from_within_a_call_of_its_own() {
         let _turn = turn.lock();
         transport.sink().introduced(&introduction);
     });
-    call.recv_timeout(PATIENCE).unwrap();
+    call.recv_timeout(TIMEOUT).unwrap();
     let mts = started.mts;
     let dropping = thread::spawn(move || drop(mts));
-    let closed_by = closes.recv_timeout(PATIENCE).unwrap();
+    let closed_by = closes.recv_timeout(TIMEOUT).unwrap();
     assert_eq!(closed_by, dropping.thread().id());
     go_on.send(()).unwrap();
     dropping.join().unwrap();

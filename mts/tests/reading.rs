@@ -25,7 +25,7 @@ use parking_lot::Mutex;
 
 use self::common::{Silent, letter};
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 const ARM: Incarnation = Incarnation::from_u64(3);
 
 /// A gate that calls the service on another thread while it reads a letter, and records the receivers
@@ -44,7 +44,7 @@ impl AccessGate for Calling {
             let received = service.try_receive(ARM).is_some();
             let _ = ended.send(received);
         });
-        let waited = end.recv_timeout(PATIENCE);
+        let waited = end.recv_timeout(TIMEOUT);
         waited.expect("the service is locked while a letter is read");
         LetterParts::default()
     }
@@ -121,7 +121,7 @@ fn the_service_is_not_locked_while_the_gate_reads_a_letter() {
             sequence: 1,
             after: 0,
             transfer: 1,
-            remaining: PATIENCE,
+            remaining: TIMEOUT,
             body: Body::Letter(letter()),
         },
         from: Hop {
@@ -189,7 +189,7 @@ fn is_asleep(task: &Path) -> bool {
 }
 
 fn until(mut condition: impl FnMut() -> bool) {
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + TIMEOUT;
     while !condition() {
         assert!(Instant::now() < end, "the condition never holds");
         thread::yield_now();

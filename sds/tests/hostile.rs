@@ -20,7 +20,7 @@ const SERVICE: [&str; 3] = ["_fipa_service_directory", "_udp", "local"];
 /// Number of announced records, unless `FIPA_FLOOD` sets another.
 const FLOOD: u32 = 10_000;
 /// Time for which a long run waits for records that may be lost.
-const PATIENCE: Duration = Duration::from_millis(100);
+const TIMEOUT: Duration = Duration::from_millis(100);
 
 struct Attacker {
     socket: UdpSocket,
@@ -186,7 +186,7 @@ async fn a_flood_of_records_is_bounded_and_others_are_found() {
         if number % 50 == 0 {
             tokio::time::sleep(Duration::from_millis(1)).await;
             let sent = Instant::now();
-            while long && heard(&victim) < enough && sent.elapsed() < PATIENCE {
+            while long && heard(&victim) < enough && sent.elapsed() < TIMEOUT {
                 tokio::time::sleep(Duration::from_millis(1)).await;
             }
             enough = heard(&victim) + 40;

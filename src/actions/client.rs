@@ -132,7 +132,7 @@ impl<'a> Robot<'a> {
     pub async fn watch_status(&self) -> Result<StatusUpdates, ActionError> {
         let ask = Ask::Status;
         let message = self.message(Performative::Subscribe, &ask)?;
-        let subscription = self.agent.subscribe(message, self.patience()).await?;
+        let subscription = self.agent.subscribe(message, self.timeout()).await?;
         Ok(StatusUpdates {
             ask,
             language: self.language,
@@ -179,12 +179,12 @@ impl<'a> Robot<'a> {
         let ask = Ask::Goal(goal.clone());
         let message = self.message(Performative::Request, &ask)?;
         let deadline = goal.deadline.map(Duration::from_millis);
-        let patience = deadline.and_then(|it| it.checked_add(GRACE + self.patience()));
+        let timeout = deadline.and_then(|it| it.checked_add(GRACE + self.timeout()));
         let request = self
             .agent
-            .request(message, patience.unwrap_or(Duration::MAX));
+            .request(message, timeout.unwrap_or(Duration::MAX));
         let mut request = request.await?;
-        match tokio::time::timeout(self.patience(), request.agreed()).await {
+        match tokio::time::timeout(self.timeout(), request.agreed()).await {
             Ok(agreed) => agreed?,
             Err(_) => return Err(ActionError::Dialogue(DialogueError::TimedOut)),
         };
@@ -197,7 +197,7 @@ impl<'a> Robot<'a> {
     }
 
     /// Returns the time for an answer: the deadlines of the message and of the answer.
-    fn patience(&self) -> Duration {
+    fn timeout(&self) -> Duration {
         self.agent.domain().inner.deadline * 2
     }
 
@@ -210,7 +210,7 @@ impl<'a> Robot<'a> {
 
     async fn query(&self, ask: &Ask) -> Result<Answer, ActionError> {
         let message = self.message(Performative::QueryRef, ask)?;
-        let request = self.agent.query(message, self.patience()).await?;
+        let request = self.agent.query(message, self.timeout()).await?;
         let answer = request.result().await?;
         read(self.language, ask, &answer)
     }
@@ -263,11 +263,11 @@ impl GoalHandle<'_> {
         let ask = Ask::StatusOf(self.id().to_owned());
         let robot = &self.robot;
         let message = robot.message(Performative::Subscribe, &ask)?;
-        let subscription = robot.agent.subscribe(message, robot.patience()).await?;
+        let subscription = robot.agent.subscribe(message, robot.timeout()).await?;
         Ok(ProgressUpdates {
             ask,
             language: robot.language,
-            patience: robot.patience(),
+            timeout: robot.timeout(),
             subscription: Some(subscription),
         })
     }
@@ -299,9 +299,9 @@ impl GoalHandle<'_> {
     /// has ended in the meantime or goes on; [`outcome`](Self::outcome) then returns its outcome.
     ///
     /// # Errors
-    /// If the robot is gone, or does not answer within `patience`.
-    pub async fn cancel(&mut self, patience: Duration) -> Result<bool, ActionError> {
-        Ok(self.request.cancel(patience).await?)
+    /// If the robot is gone, or does not answer within `timeout`.
+    pub async fn cancel(&mut self, timeout: Duration) -> Result<bool, ActionError> {
+        Ok(self.request.cancel(timeout).await?)
     }
 }
 
@@ -320,7 +320,7 @@ impl fmt::Debug for GoalHandle<'_> {
 pub struct ProgressUpdates {
     ask: Ask,
     language: &'static dyn Language,
-    patience: Duration,
+    timeout: Duration,
     /// `None` after the end of the goal.
     subscription: Option<Subscription>,
 }
@@ -344,7 +344,7 @@ impl ProgressUpdates {
             && let Some(mut ended) = self.subscription.take()
         {
             // The robot ends the subscription.
-            let _ = tokio::time::timeout(self.patience, ended.next()).await;
+            let _ = tokio::time::timeout(self.timeout, ended.next()).await;
         }
         Ok(status)
     }
@@ -377,8 +377,8 @@ impl StatusUpdates {
     /// Cancels the subscription.
     ///
     /// # Errors
-    /// If the robot does not confirm within `patience`.
-    pub async fn cancel(self, patience: Duration) -> Result<(), ActionError> {
-        Ok(self.subscription.cancel(patience).await?)
+    /// If the robot does not confirm within `timeout`.
+    pub async fn cancel(self, timeout: Duration) -> Result<(), ActionError> {
+        Ok(self.subscription.cancel(timeout).await?)
     }
 }

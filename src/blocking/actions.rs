@@ -249,8 +249,8 @@ impl<'a> GoalHandle<'a> {
     ///
     /// # Errors
     /// As for the async call.
-    pub fn cancel(&mut self, patience: Duration) -> Result<bool, ActionError> {
-        self.runtime.block_on(self.handle.cancel(patience))
+    pub fn cancel(&mut self, timeout: Duration) -> Result<bool, ActionError> {
+        self.runtime.block_on(self.handle.cancel(timeout))
     }
 }
 
@@ -285,7 +285,7 @@ impl StatusUpdates<'_> {
     ///
     /// # Errors
     /// As for the async call.
-    pub fn cancel(self, patience: Duration) -> Result<(), ActionError> {
-        self.runtime.block_on(self.updates.cancel(patience))
+    pub fn cancel(self, timeout: Duration) -> Result<(), ActionError> {
+        self.runtime.block_on(self.updates.cancel(timeout))
     }
 }

@@ -45,8 +45,8 @@ impl Agent {
     ///
     /// # Errors
     /// See [`crate::Agent::query_locks`].
-    pub fn query_locks(&self, patience: Duration) -> Result<Vec<ResourceStatus>, LockError> {
-        self.runtime.block_on(self.agent.query_locks(patience))
+    pub fn query_locks(&self, timeout: Duration) -> Result<Vec<ResourceStatus>, LockError> {
+        self.runtime.block_on(self.agent.query_locks(timeout))
     }
 
     /// See [`crate::Agent::lock`].
@@ -125,11 +125,11 @@ impl Deref for Lock {
 
 impl Lock {
     /// Waits until the lock is lost, and returns the reason; `None` if it is still held after
-    /// `patience`. See [`crate::locks::Lock::lost`].
+    /// `timeout`. See [`crate::locks::Lock::lost`].
     #[must_use]
-    pub fn lost_within(&self, patience: Duration) -> Option<LockError> {
+    pub fn lost_within(&self, timeout: Duration) -> Option<LockError> {
         self.runtime.block_on(async {
-            let lost = tokio::time::timeout(patience, self.lock.lost());
+            let lost = tokio::time::timeout(timeout, self.lock.lost());
             lost.await.ok()
         })
     }
@@ -147,12 +147,12 @@ impl Deref for Owned {
 }
 
 impl Owned {
-    /// Waits for the next event; returns `None` if there is none within `patience`, or if the agent is
+    /// Waits for the next event; returns `None` if there is none within `timeout`, or if the agent is
     /// deregistered. See [`crate::locks::Owned::next`].
     #[must_use]
-    pub fn next_within(&self, patience: Duration) -> Option<OwnerEvent> {
+    pub fn next_within(&self, timeout: Duration) -> Option<OwnerEvent> {
         self.runtime.block_on(async {
-            let next = tokio::time::timeout(patience, self.owned.next());
+            let next = tokio::time::timeout(timeout, self.owned.next());
             next.await.ok().flatten()
         })
     }

@@ -153,7 +153,7 @@ impl Notifications<'_> {
     ///
     /// # Errors
     /// As for the async call.
-    pub fn cancel(self, patience: Duration) -> Result<(), PlatformError> {
-        self.runtime.block_on(self.notifications.cancel(patience))
+    pub fn cancel(self, timeout: Duration) -> Result<(), PlatformError> {
+        self.runtime.block_on(self.notifications.cancel(timeout))
     }
 }

@@ -74,9 +74,9 @@ impl Agent {
     pub fn request(
         &self,
         request: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Side<Request>, DialogueError> {
-        self.side(self.agent.request(request, patience))
+        self.side(self.agent.request(request, timeout))
     }
 
     /// See [`crate::Agent::query`].
@@ -86,9 +86,9 @@ impl Agent {
     pub fn query(
         &self,
         query: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Side<Request>, DialogueError> {
-        self.side(self.agent.query(query, patience))
+        self.side(self.agent.query(query, timeout))
     }
 
     /// See [`crate::Agent::request_when`].
@@ -98,9 +98,9 @@ impl Agent {
     pub fn request_when(
         &self,
         request: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Side<Request>, DialogueError> {
-        self.side(self.agent.request_when(request, patience))
+        self.side(self.agent.request_when(request, timeout))
     }
 
     /// See [`crate::Agent::propose`].
@@ -110,10 +110,9 @@ impl Agent {
     pub fn propose(
         &self,
         proposal: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Decision, DialogueError> {
-        self.runtime
-            .block_on(self.agent.propose(proposal, patience))
+        self.runtime.block_on(self.agent.propose(proposal, timeout))
     }
 
     /// See [`crate::Agent::subscribe`].
@@ -123,9 +122,9 @@ impl Agent {
     pub fn subscribe(
         &self,
         subscribe: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Side<Subscription>, DialogueError> {
-        self.side(self.agent.subscribe(subscribe, patience))
+        self.side(self.agent.subscribe(subscribe, timeout))
     }
 
     /// See [`crate::Agent::contract_net`].
@@ -136,12 +135,12 @@ impl Agent {
         &self,
         call: MessageBuilder,
         receivers: &[A],
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Side<ContractNet>, DialogueError>
     where
         A: Clone + TryInto<AgentId, Error: Into<AgentIdError>>,
     {
-        self.side(self.agent.contract_net(call, receivers, patience))
+        self.side(self.agent.contract_net(call, receivers, timeout))
     }
 
     /// See [`crate::Agent::iterated_contract_net`].
@@ -152,12 +151,12 @@ impl Agent {
         &self,
         call: MessageBuilder,
         receivers: &[A],
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Side<ContractNet>, DialogueError>
     where
         A: Clone + TryInto<AgentId, Error: Into<AgentIdError>>,
     {
-        self.side(self.agent.iterated_contract_net(call, receivers, patience))
+        self.side(self.agent.iterated_contract_net(call, receivers, timeout))
     }
 
     /// See [`crate::Agent::english_auction`].
@@ -191,9 +190,9 @@ impl Agent {
     pub fn brokering(
         &self,
         proxy: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Side<Proxied>, DialogueError> {
-        self.side(self.agent.brokering(proxy, patience))
+        self.side(self.agent.brokering(proxy, timeout))
     }
 
     /// See [`crate::Agent::recruiting`].
@@ -203,9 +202,9 @@ impl Agent {
     pub fn recruiting(
         &self,
         proxy: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Side<Proxied>, DialogueError> {
-        self.side(self.agent.recruiting(proxy, patience))
+        self.side(self.agent.recruiting(proxy, timeout))
     }
 
     /// See [`crate::Agent::take_part`].
@@ -305,24 +304,24 @@ impl Side<PartnerWatch> {
         self.inner.remove(agent);
     }
 
-    /// Waits up to `patience` for the next event; see [`PartnerWatch::next`].
-    pub fn next_within(&mut self, patience: Duration) -> Option<PartnerEvent> {
+    /// Waits up to `timeout` for the next event; see [`PartnerWatch::next`].
+    pub fn next_within(&mut self, timeout: Duration) -> Option<PartnerEvent> {
         let inner = &mut self.inner;
         self.runtime
-            .block_on(async { tokio::time::timeout(patience, inner.next()).await.ok() })
+            .block_on(async { tokio::time::timeout(timeout, inner.next()).await.ok() })
     }
 }
 
 impl Side<Subscription> {
-    /// Waits up to `patience` for the next notification; returns `None` if none arrives. See
+    /// Waits up to `timeout` for the next notification; returns `None` if none arrives. See
     /// [`Subscription::next`].
     ///
     /// # Errors
     /// As for the async call.
-    pub fn next_within(&mut self, patience: Duration) -> Result<Option<Message>, DialogueError> {
+    pub fn next_within(&mut self, timeout: Duration) -> Result<Option<Message>, DialogueError> {
         let inner = &mut self.inner;
         self.runtime.block_on(async {
-            match tokio::time::timeout(patience, inner.next()).await {
+            match tokio::time::timeout(timeout, inner.next()).await {
                 Ok(received) => received.map(Some),
                 Err(_) => Ok(None),
             }
@@ -359,60 +358,60 @@ macro_rules! blocking {
 blocking! { Request:
     fn agreed() -> bool;
     #[last] fn result() -> Message;
-    fn cancel(patience: Duration) -> bool;
+    fn cancel(timeout: Duration) -> bool;
 }
 
 blocking! { Subscription:
     fn next() -> Message;
-    #[last] fn cancel(patience: Duration) -> ();
+    #[last] fn cancel(timeout: Duration) -> ();
 }
 
 blocking! { ContractNet:
-    fn call_again(invited: &[Message], call: MessageBuilder, patience: Duration) -> ();
-    fn award(accepted: &[Message], content: &str, patience: Duration) -> Vec<Awarded>;
-    #[last] fn cancel(patience: Duration) -> ();
+    fn call_again(invited: &[Message], call: MessageBuilder, timeout: Duration) -> ();
+    fn award(accepted: &[Message], content: &str, timeout: Duration) -> Vec<Awarded>;
+    #[last] fn cancel(timeout: Duration) -> ();
 }
 
 blocking! { Auction:
-    fn call(price: impl Into<Bytes>, patience: Duration) -> Bids;
+    fn call(price: impl Into<Bytes>, timeout: Duration) -> Bids;
     fn accept(bid: &Message, content: impl Into<Bytes>) -> ();
     fn close(content: impl Into<Bytes>) -> ();
     #[last] fn ask_winner(content: impl Into<Bytes>) -> ();
 }
 
 blocking! { Proxied:
-    fn next(patience: Duration) -> Message;
+    fn next(timeout: Duration) -> Message;
     fn answer(
         to: &Message,
         act: Performative,
         content: impl Into<Bytes>,
-        patience: Duration
+        timeout: Duration
     ) -> ();
-    #[last] fn cancel(patience: Duration) -> ();
+    #[last] fn cancel(timeout: Duration) -> ();
 }
 
 blocking! { Task:
     fn agree(content: impl Into<Bytes>) -> ();
     fn inform(content: impl Into<Bytes>) -> ();
-    fn propose(content: impl Into<Bytes>, patience: Duration) -> bool;
-    fn next_call(patience: Duration) -> Option<Message>;
-    fn next(patience: Duration) -> Message;
-    fn pass_on(message: MessageBuilder, patience: Duration) -> ();
-    fn next_answer(patience: Duration) -> Option<Message>;
+    fn propose(content: impl Into<Bytes>, timeout: Duration) -> bool;
+    fn next_call(timeout: Duration) -> Option<Message>;
+    fn next(timeout: Duration) -> Message;
+    fn pass_on(message: MessageBuilder, timeout: Duration) -> ();
+    fn next_answer(timeout: Duration) -> Option<Message>;
     fn forward(answer: &Message) -> ();
     fn confirm_cancel() -> Reply;
     #[last] fn reply(reply: Reply) -> ();
 }
 
 impl Side<Task> {
-    /// Waits up to `patience` for a cancel of the initiator, and returns whether it came. For a
+    /// Waits up to `timeout` for a cancel of the initiator, and returns whether it came. For a
     /// participant that checks between two steps of its work; see [`Task::cancelled`].
     ///
     /// # Errors
     /// As for the async call.
-    pub fn cancelled(&mut self, patience: Duration) -> Result<bool, DialogueError> {
+    pub fn cancelled(&mut self, timeout: Duration) -> Result<bool, DialogueError> {
         self.runtime.block_on(async {
-            match tokio::time::timeout(patience, self.inner.cancelled()).await {
+            match tokio::time::timeout(timeout, self.inner.cancelled()).await {
                 Ok(cancelled) => cancelled.map(|()| true),
                 Err(_) => Ok(false),
             }

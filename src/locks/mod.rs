@@ -155,12 +155,12 @@ impl Agent {
     }
 
     /// Asks the owners of all resources in the directory for their state, and waits for their answers
-    /// up to `patience`. A resource whose owner does not answer is listed without details.
+    /// up to `timeout`. A resource whose owner does not answer is listed without details.
     ///
     /// # Errors
     /// If the agent was deregistered.
-    pub async fn query_locks(&self, patience: Duration) -> Result<Vec<ResourceStatus>, LockError> {
-        report::query(&self.core, patience).await
+    pub async fn query_locks(&self, timeout: Duration) -> Result<Vec<ResourceStatus>, LockError> {
+        report::query(&self.core, timeout).await
     }
 
     /// Requests a resource, and waits until this agent holds it. Dropping the future withdraws the

@@ -226,7 +226,7 @@ impl Drop for Questions<'_> {
 /// Asks all owners that the directory lists.
 pub(super) async fn query(
     core: &Arc<AgentCore>,
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<Vec<ResourceStatus>, LockError> {
     let endpoint = &core.endpoint;
     endpoint.domain.inner.owner.check()?;
@@ -269,8 +269,8 @@ pub(super) async fn query(
     }
     let question = question.build()?;
     let letter = letter_for(&question, SystemTime::now());
-    drop(endpoint.send(&question, letter, patience)?);
-    let until = tokio::time::Instant::now() + patience;
+    drop(endpoint.send(&question, letter, timeout)?);
+    let until = tokio::time::Instant::now() + timeout;
     while waits_for > 0 {
         let next = core.demultiplexer.next_of(endpoint, &questions.key);
         let Ok(incoming) = tokio::time::timeout_at(until, next).await else {

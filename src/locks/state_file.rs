@@ -17,7 +17,7 @@ use fipa_transport::log_limit;
 const VARIABLE: &str = "FIPA_STATE_DIR";
 
 /// Wait for the file of an owner of this process that is being closed.
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 const PAUSE: Duration = Duration::from_millis(5);
 
 /// The error of using the state file of an owner.
@@ -95,7 +95,7 @@ impl StateFile {
         let started = Instant::now();
         while let Err(error) = lock.try_lock() {
             match error {
-                TryLockError::WouldBlock if started.elapsed() < PATIENCE => {
+                TryLockError::WouldBlock if started.elapsed() < TIMEOUT => {
                     std::thread::sleep(PAUSE);
                 }
                 TryLockError::WouldBlock => return Err(StateFileError::InUse { path }),

@@ -167,9 +167,9 @@ impl Notifications {
     /// Cancels the subscription.
     ///
     /// # Errors
-    /// If the directory facilitator does not confirm within `patience`.
-    pub async fn cancel(self, patience: Duration) -> Result<(), PlatformError> {
-        Ok(self.subscription.cancel(patience).await?)
+    /// If the directory facilitator does not confirm within `timeout`.
+    pub async fn cancel(self, timeout: Duration) -> Result<(), PlatformError> {
+        Ok(self.subscription.cancel(timeout).await?)
     }
 }
 

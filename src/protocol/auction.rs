@@ -127,7 +127,7 @@ impl Auction {
     }
 
     /// Calls a price to all bidders (`cfp`) and collects the bids until all have bid, at most for
-    /// `patience`. Undecided bids of the previous call are rejected first. A bid that arrives after the
+    /// `timeout`. Undecided bids of the previous call are rejected first. A bid that arrives after the
     /// time of its call is ignored, because its bidder has been called again.
     ///
     /// # Errors
@@ -135,10 +135,10 @@ impl Auction {
     pub async fn call(
         &mut self,
         price: impl Into<Bytes>,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Bids, DialogueError> {
         let rejections = self.reject_undecided()?;
-        let due = after(patience);
+        let due = after(timeout);
         let mut bids = Bids::default();
         if self.bidders.is_empty() {
             settle(rejections, due).await;

@@ -17,7 +17,7 @@ use crate::delivery::{Sent, deliveries};
 
 impl Agent {
     /// Calls for proposals (`cfp`, FIPA00029) and collects the answers until all receivers have
-    /// answered, at most for `patience`. Receivers that cannot be reached, or are gone, count as silent, and
+    /// answered, at most for `timeout`. Receivers that cannot be reached, or are gone, count as silent, and
     /// are not waited for.
     ///
     /// The receivers are [`AgentId`]s or names. A pattern or a coalition among them stands for the agents known now, which
@@ -45,13 +45,13 @@ impl Agent {
         &self,
         call: MessageBuilder,
         receivers: &[A],
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<ContractNet, DialogueError>
     where
         A: Clone + TryInto<AgentId, Error: Into<AgentIdError>>,
     {
         let receivers = identified(receivers)?;
-        ContractNet::begin(&self.core, "fipa-contract-net", call, &receivers, patience).await
+        ContractNet::begin(&self.core, "fipa-contract-net", call, &receivers, timeout).await
     }
 
     /// Calls for proposals like [`contract_net`](Self::contract_net), with the iterated protocol
@@ -63,14 +63,14 @@ impl Agent {
         &self,
         call: MessageBuilder,
         receivers: &[A],
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<ContractNet, DialogueError>
     where
         A: Clone + TryInto<AgentId, Error: Into<AgentIdError>>,
     {
         let protocol = "fipa-iterated-contract-net";
         let receivers = identified(receivers)?;
-        ContractNet::begin(&self.core, protocol, call, &receivers, patience).await
+        ContractNet::begin(&self.core, protocol, call, &receivers, timeout).await
     }
 }
 
@@ -113,9 +113,9 @@ impl ContractNet {
         protocol: &str,
         call: MessageBuilder,
         receivers: &[AgentId],
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Self, DialogueError> {
-        let due = after(patience);
+        let due = after(timeout);
         let expanded = expand(core, receivers);
         let call = call.receivers(expanded.agents.clone());
         let (dialogue, sent) = Dialogue::open(core, protocol, call, due).await?;
@@ -170,9 +170,9 @@ impl ContractNet {
         &mut self,
         invited: &[Message],
         call: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<(), DialogueError> {
-        let due = after(patience);
+        let due = after(timeout);
         let before = std::mem::take(&mut self.bids.proposals);
         let (again, others): (Vec<_>, Vec<_>) = before
             .into_iter()
@@ -216,9 +216,9 @@ impl ContractNet {
         &mut self,
         accepted: &[Message],
         content: &str,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Vec<Awarded>, DialogueError> {
-        let due = after(patience);
+        let due = after(timeout);
         let mut results = Vec::new();
         let mut working = Vec::new();
         let mut sent = Vec::new();
@@ -303,9 +303,9 @@ impl ContractNet {
     ///
     /// # Errors
     /// If an agent does not cancel ([`DialogueError::Failed`]), cannot be reached, or does not answer
-    /// within `patience`.
-    pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
-        self.dialogue.cancel(self.open, after(patience)).await
+    /// within `timeout`.
+    pub async fn cancel(mut self, timeout: Duration) -> Result<(), DialogueError> {
+        self.dialogue.cancel(self.open, after(timeout)).await
     }
 
     /// Waits until these agents have answered, or until `due`.

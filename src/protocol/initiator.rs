@@ -14,7 +14,7 @@ use crate::agent::{Agent, AgentCore};
 impl Agent {
     /// Requests an action from an agent (FIPA00026). The message is a `request` with one receiver. The
     /// call sets its protocol, conversation id, `reply-with` and `reply-by`. All answers must arrive
-    /// within `patience`.
+    /// within `timeout`.
     ///
     /// The receiver may be a pattern, or a coalition with a leader, that stands for one agent now. The
     /// request ends with [`DialogueError::Gone`] as soon as the host of the agent reports that it has left
@@ -44,9 +44,9 @@ impl Agent {
     pub async fn request(
         &self,
         request: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Request, DialogueError> {
-        Request::begin(&self.core, "fipa-request", request, patience).await
+        Request::begin(&self.core, "fipa-request", request, timeout).await
     }
 
     /// Queries an agent for the truth of a proposition (`query-if`) or for an object (`query-ref`)
@@ -57,9 +57,9 @@ impl Agent {
     pub async fn query(
         &self,
         query: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Request, DialogueError> {
-        Request::begin(&self.core, "fipa-query", query, patience).await
+        Request::begin(&self.core, "fipa-query", query, timeout).await
     }
 
     /// Requests an action from an agent once a condition holds (`request-when`, FIPA00028); see
@@ -70,9 +70,9 @@ impl Agent {
     pub async fn request_when(
         &self,
         request: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Request, DialogueError> {
-        Request::begin(&self.core, "fipa-request-when", request, patience).await
+        Request::begin(&self.core, "fipa-request-when", request, timeout).await
     }
 
     /// Proposes an action of this agent to another agent (`propose`, FIPA00036), and waits for the
@@ -80,13 +80,13 @@ impl Agent {
     ///
     /// # Errors
     /// If the message does not begin the protocol, is not delivered, or is not decided on within
-    /// `patience`.
+    /// `timeout`.
     pub async fn propose(
         &self,
         proposal: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Decision, DialogueError> {
-        let due = after(patience);
+        let due = after(timeout);
         let (proposal, _) = single(&self.core, proposal)?;
         let opened = Dialogue::open(&self.core, "fipa-propose", proposal, due);
         let (mut dialogue, sent) = opened.await?;
@@ -166,9 +166,9 @@ impl Request {
         core: &Arc<AgentCore>,
         protocol: &str,
         request: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Self, DialogueError> {
-        let due = after(patience);
+        let due = after(timeout);
         let (request, receivers) = single(core, request)?;
         let (dialogue, sent) = Dialogue::open(core, protocol, request, due).await?;
         only_delivered(&sent)?;
@@ -233,13 +233,13 @@ impl Request {
     /// returns its result.
     ///
     /// # Errors
-    /// If the other side is gone, or does not answer within `patience`. [`result`](Self::result) can
+    /// If the other side is gone, or does not answer within `timeout`. [`result`](Self::result) can
     /// still wait.
-    pub async fn cancel(&mut self, patience: Duration) -> Result<bool, DialogueError> {
+    pub async fn cancel(&mut self, timeout: Duration) -> Result<bool, DialogueError> {
         if self.end.is_some() {
             return Ok(matches!(self.end, Some(End::Cancelled(_))));
         }
-        let due = after(patience);
+        let due = after(timeout);
         let cancel = self.dialogue.agent().message(Performative::Cancel);
         let cancel = cancel.receivers(self.receivers.clone());
         only_delivered(&self.dialogue.send(cancel, due).await?)?;

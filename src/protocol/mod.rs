@@ -19,8 +19,8 @@
 //! The silence of a host proves nothing. While a call waits for an agent of another host, the gateways
 //! exchange signs of life. After a silence of `monitor.heartbeat` (default 5 s), the agent is
 //! *unreachable*: `reachability()` of the conversation reports this, the call goes on within its
-//! patience, and ends with [`DialogueError::Unreachable`] instead of [`DialogueError::TimedOut`] if no
-//! answer arrives. A subscription, which has no patience, returns this error once and goes on. A process
+//! timeout, and ends with [`DialogueError::Unreachable`] instead of [`DialogueError::TimedOut`] if no
+//! answer arrives. A subscription, which has no timeout, returns this error once and goes on. A process
 //! that is stopped but not ended is not detected. Agents of legacy peers have no signs of life.
 //!
 //! Applications that lead a conversation without these calls use [`Agent::watch_partners`].

@@ -217,14 +217,14 @@ impl Task {
     ///
     /// # Errors
     /// If the protocol does not allow the message in this state, if it is not delivered, or if no
-    /// decision arrives within `patience`.
+    /// decision arrives within `timeout`.
     pub async fn propose(
         &mut self,
         content: impl Into<Bytes>,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<bool, DialogueError> {
         self.send(Performative::Propose, content).await?;
-        let answer = self.receive(after(patience)).await?;
+        let answer = self.receive(after(timeout)).await?;
         match answer.performative() {
             Performative::AcceptProposal => Ok(true),
             Performative::RejectProposal => Ok(false),
@@ -245,16 +245,16 @@ impl Task {
     /// # use fipa::protocol::{DialogueError, Task};
     /// use std::time::Duration;
     ///
-    /// const PATIENCE: Duration = Duration::from_secs(60);
+    /// const TIMEOUT: Duration = Duration::from_secs(60);
     ///
     /// /// Bids up to 20 in an English auction, and returns whether it has won.
     /// async fn bid(task: &mut Task) -> Result<bool, DialogueError> {
-    ///     while let Some(call) = task.next_call(PATIENCE).await? {
+    ///     while let Some(call) = task.next_call(TIMEOUT).await? {
     ///         let price = String::from_utf8_lossy(call.content().map_or(b"", |c| c)).into_owned();
     ///         // The leading bidder gains nothing from a higher bid.
     ///         let leads = task.state() == "called-leading";
     ///         if !leads && price.parse::<u32>().is_ok_and(|price| price <= 20) {
-    ///             task.propose("", PATIENCE).await?;
+    ///             task.propose("", TIMEOUT).await?;
     ///         }
     ///     }
     ///     Ok(task.state() == "won")
@@ -262,15 +262,12 @@ impl Task {
     /// ```
     ///
     /// # Errors
-    /// If no message arrives within `patience`, or a message of another kind arrives.
-    pub async fn next_call(
-        &mut self,
-        patience: Duration,
-    ) -> Result<Option<Message>, DialogueError> {
+    /// If no message arrives within `timeout`, or a message of another kind arrives.
+    pub async fn next_call(&mut self, timeout: Duration) -> Result<Option<Message>, DialogueError> {
         if self.early.is_none() && self.dialogue.is_over() {
             return Ok(None);
         }
-        let message = self.next(patience).await?;
+        let message = self.next(timeout).await?;
         match message.performative() {
             Performative::Cfp => Ok(Some(message)),
             Performative::Inform | Performative::RejectProposal => Ok(None),
@@ -282,11 +279,11 @@ impl Task {
     /// auction.
     ///
     /// # Errors
-    /// If no message arrives within `patience`.
-    pub async fn next(&mut self, patience: Duration) -> Result<Message, DialogueError> {
+    /// If no message arrives within `timeout`.
+    pub async fn next(&mut self, timeout: Duration) -> Result<Message, DialogueError> {
         match self.early.take() {
             Some(early) => Ok(early),
-            None => self.receive(after(patience)).await,
+            None => self.receive(after(timeout)).await,
         }
     }
 
@@ -308,10 +305,10 @@ impl Task {
     ///     };
     ///     let query = agent.message(Performative::QueryRef).receiver(arm);
     ///     let query = query.protocol("fipa-query").content("(load ?x)");
-    ///     let patience = Duration::from_secs(5);
-    ///     task.pass_on(query, patience).await?;
+    ///     let timeout = Duration::from_secs(5);
+    ///     task.pass_on(query, timeout).await?;
     ///     task.inform("passed on").await?;
-    ///     while let Some(answer) = task.next_answer(patience).await? {
+    ///     while let Some(answer) = task.next_answer(timeout).await? {
     ///         task.forward(&answer).await?;
     ///     }
     ///     Ok(Reply::Nothing)
@@ -324,7 +321,7 @@ impl Task {
     pub async fn pass_on(
         &mut self,
         message: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<(), DialogueError> {
         let recruits = self.dialogue.follows("fipa-recruiting");
         let mut message = message;
@@ -346,7 +343,7 @@ impl Task {
             let agents = to_initiator.receivers().iter().cloned();
             message = agents.fold(message, MessageBuilder::reply_to);
         }
-        let sent = self.dialogue.post_within(message, after(patience))?;
+        let sent = self.dialogue.post_within(message, after(timeout))?;
         let sent = self.dialogue.outcomes(sent).await;
         let lost: Vec<&str> = unreached(&sent).collect();
         let all = built.receivers().iter().map(|agent| agent.name());
@@ -370,13 +367,13 @@ impl Task {
     /// further agent can answer.
     ///
     /// # Errors
-    /// If no answer arrives within `patience`, if the initiator cancels, or if the initiator or an agent
+    /// If no answer arrives within `timeout`, if the initiator cancels, or if the initiator or an agent
     /// that was to answer is gone.
     pub async fn next_answer(
         &mut self,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Option<Message>, DialogueError> {
-        let due = after(patience);
+        let due = after(timeout);
         while !self.asked.is_empty() {
             let (answer, over) = match self.dialogue.receive(due).await {
                 Ok(received) => (received.message, received.meaning.over),

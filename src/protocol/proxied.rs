@@ -33,13 +33,13 @@ impl Agent {
     ///
     /// # Errors
     /// If the message does not begin the protocol or is not delivered, or if the broker refuses, finds
-    /// no agent ([`DialogueError::Failed`]) or does not answer within `patience`.
+    /// no agent ([`DialogueError::Failed`]) or does not answer within `timeout`.
     pub async fn brokering(
         &self,
         proxy: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Proxied, DialogueError> {
-        Proxied::begin(&self.core, "fipa-brokering", proxy, patience).await
+        Proxied::begin(&self.core, "fipa-brokering", proxy, timeout).await
     }
 
     /// Requests a recruiter to pass a message on to suitable agents (FIPA00034), which answer this agent
@@ -52,9 +52,9 @@ impl Agent {
     pub async fn recruiting(
         &self,
         proxy: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Proxied, DialogueError> {
-        Proxied::begin(&self.core, "fipa-recruiting", proxy, patience).await
+        Proxied::begin(&self.core, "fipa-recruiting", proxy, timeout).await
     }
 }
 
@@ -77,9 +77,9 @@ impl Proxied {
         core: &Arc<AgentCore>,
         protocol: &str,
         proxy: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Self, DialogueError> {
-        let due = after(patience);
+        let due = after(timeout);
         let (proxy, receivers) = single(core, proxy)?;
         let (dialogue, sent) = Dialogue::open(core, protocol, proxy, due).await?;
         only_delivered(&sent)?;
@@ -129,17 +129,17 @@ impl Proxied {
         self.dialogue.id()
     }
 
-    /// Waits for the next answer of any performative, at most for `patience`. The protocol does not mark
+    /// Waits for the next answer of any performative, at most for `timeout`. The protocol does not mark
     /// the last answer.
     ///
     /// # Errors
     /// If no answer arrives in time, if the broker sends `failure` or is gone, or if a recruited agent
     /// that was [answered](Self::answer) is gone.
-    pub async fn next(&mut self, patience: Duration) -> Result<Message, DialogueError> {
+    pub async fn next(&mut self, timeout: Duration) -> Result<Message, DialogueError> {
         if let Some(early) = self.early.pop_front() {
             return Ok(early);
         }
-        let due = after(patience);
+        let due = after(timeout);
         loop {
             let Interpreted { message, meaning } = self.dialogue.receive(due).await?;
             match message.performative() {
@@ -160,11 +160,11 @@ impl Proxied {
     /// # use fipa::Performative;
     /// # use fipa::protocol::{DialogueError, Proxied};
     /// # async fn example(mut answers: Proxied) -> Result<(), DialogueError> {
-    /// let patience = Duration::from_secs(5);
-    /// let proposal = answers.next(patience).await?;
+    /// let timeout = Duration::from_secs(5);
+    /// let proposal = answers.next(timeout).await?;
     /// let accept = Performative::AcceptProposal;
-    /// answers.answer(&proposal, accept, "", patience).await?;
-    /// println!("{}", answers.next(patience).await?);
+    /// answers.answer(&proposal, accept, "", timeout).await?;
+    /// println!("{}", answers.next(timeout).await?);
     /// # Ok(())
     /// # }
     /// ```
@@ -177,9 +177,9 @@ impl Proxied {
         to: &Message,
         act: Performative,
         content: impl Into<bytes::Bytes>,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<(), DialogueError> {
-        let due = after(patience);
+        let due = after(timeout);
         self.dialogue.answer_within(to, act, content, due).await?;
         if let Some(agent) = to.sender().filter(|_| to.reply_to().is_empty()) {
             self.dialogue.watch(agent.name());
@@ -190,11 +190,11 @@ impl Proxied {
     /// Cancels the request and waits for the confirmation of the broker or recruiter.
     ///
     /// # Errors
-    /// If it does not cancel ([`DialogueError::Failed`]), or does not answer within `patience`.
-    pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
+    /// If it does not cancel ([`DialogueError::Failed`]), or does not answer within `timeout`.
+    pub async fn cancel(mut self, timeout: Duration) -> Result<(), DialogueError> {
         for receiver in &self.receivers {
             self.dialogue.watch(receiver.name());
         }
-        self.dialogue.cancel(self.receivers, after(patience)).await
+        self.dialogue.cancel(self.receivers, after(timeout)).await
     }
 }

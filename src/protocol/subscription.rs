@@ -43,13 +43,13 @@ impl Agent {
     ///
     /// # Errors
     /// If the message does not begin the protocol, is not delivered, is refused, or is not answered
-    /// within `patience`.
+    /// within `timeout`.
     pub async fn subscribe(
         &self,
         subscribe: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Subscription, DialogueError> {
-        Subscription::begin(&self.core, subscribe, patience).await
+        Subscription::begin(&self.core, subscribe, timeout).await
     }
 }
 
@@ -76,9 +76,9 @@ impl Subscription {
     pub(crate) async fn begin(
         core: &Arc<AgentCore>,
         subscribe: MessageBuilder,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Self, DialogueError> {
-        let due = after(patience);
+        let due = after(timeout);
         let (subscribe, receivers) = single(core, subscribe)?;
         let opened = Dialogue::open(core, "fipa-subscribe", subscribe, due);
         let (mut dialogue, sent) = opened.await?;
@@ -133,11 +133,11 @@ impl Subscription {
     ///
     /// # Errors
     /// If the other side continues the subscription ([`DialogueError::Failed`]), is gone, or does not
-    /// answer within `patience`.
-    pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
+    /// answer within `timeout`.
+    pub async fn cancel(mut self, timeout: Duration) -> Result<(), DialogueError> {
         self.waiting = None;
         let mut dialogue = self.dialogue.lock().await;
-        dialogue.cancel(self.receivers, after(patience)).await
+        dialogue.cancel(self.receivers, after(timeout)).await
     }
 }
 

@@ -26,7 +26,7 @@ use support::{config, load, mark, two};
 use tokio::sync::Semaphore;
 
 /// Time limit of all waits, which a passing test does not reach.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 #[test]
 #[ignore = "started by the other tests"]
@@ -159,7 +159,7 @@ async fn actions_are_listed_invoked_with_progress_and_cancelled() {
             ("drive", "rover")
         );
         assert_eq!(running[0].goal, goal.id());
-        assert!(goal.cancel(PATIENCE).await.unwrap());
+        assert!(goal.cancel(TIMEOUT).await.unwrap());
         assert_eq!(crex.status().await.unwrap(), []);
     }
 }
@@ -243,7 +243,7 @@ async fn refusals_are_typed_and_wrong_goals_reach_no_handler() {
             .ontology(fipa::actions::ONTOLOGY)
             .language(language)
             .content(content);
-        let request = rover.request(request, PATIENCE).await.unwrap();
+        let request = rover.request(request, TIMEOUT).await.unwrap();
         let refused = request.result().await;
         assert!(
             matches!(refused, Err(DialogueError::Refused(_))),
@@ -367,7 +367,7 @@ async fn deadlines_policies_and_withdrawals_end_goals() {
         "{withdrawn:?}"
     );
     while !updates.next().await.unwrap().is_empty() {}
-    updates.cancel(PATIENCE).await.unwrap();
+    updates.cancel(TIMEOUT).await.unwrap();
     assert_eq!(crex.actions().await.unwrap(), []);
     let unknown = crex.invoke("drive", &()).await;
     assert!(matches!(
@@ -408,11 +408,11 @@ async fn a_robot_that_is_killed_ends_the_handle() {
     });
     robot.kill();
     let is_gone = |error: &ActionError| matches!(error, ActionError::Dialogue(DialogueError::Gone { agent }) if agent == "robot");
-    let ended = tokio::time::timeout(PATIENCE, goal.result::<()>())
+    let ended = tokio::time::timeout(TIMEOUT, goal.result::<()>())
         .await
         .unwrap();
     assert!(ended.as_ref().is_err_and(is_gone), "{ended:?}");
-    let ended = tokio::time::timeout(PATIENCE, waiting)
+    let ended = tokio::time::timeout(TIMEOUT, waiting)
         .await
         .unwrap()
         .unwrap();
@@ -444,7 +444,7 @@ async fn the_goal_of_a_killed_client_is_cancelled_unless_the_action_says_otherwi
     let mut updates = robot.watch_status().await.unwrap();
     assert_eq!(updates.next().await.unwrap().len(), 2);
     client.kill();
-    let cancelled = tokio::time::timeout(PATIENCE, stopped.acquire()).await;
+    let cancelled = tokio::time::timeout(TIMEOUT, stopped.acquire()).await;
     cancelled.unwrap().unwrap().forget();
     loop {
         let running = updates.next().await.unwrap();
@@ -550,12 +550,12 @@ async fn a_goal_runs_only_with_the_fence_of_the_live_lock() {
         Err(ActionError::Refused(reason)) => reason,
         other => panic!("{other:?}"),
     };
-    let lock = rover.lock_within("bay", PATIENCE).await.unwrap();
+    let lock = rover.lock_within("bay", TIMEOUT).await.unwrap();
     let first = lock.fence().unwrap().clone();
     let mut goal = crex.send(with(Some(&first))).await.unwrap();
     assert_eq!(goal.outcome().await.unwrap(), None);
     lock.release();
-    let lock = rover.lock_within("bay", PATIENCE).await.unwrap();
+    let lock = rover.lock_within("bay", TIMEOUT).await.unwrap();
     let second = lock.fence().unwrap().clone();
     let mut goal = crex.send(with(Some(&second))).await.unwrap();
     assert_eq!(goal.outcome().await.unwrap(), None);
@@ -564,7 +564,7 @@ async fn a_goal_runs_only_with_the_fence_of_the_live_lock() {
     assert_eq!(stale, Refusal::StaleFence(first.to_string()));
     assert!(stale.to_string().contains(&first.to_string()), "{stale}");
     assert_eq!(refusal(crex.send(with(None)).await), Refusal::MissingFence);
-    let door = rover.lock_within("door", PATIENCE).await.unwrap();
+    let door = rover.lock_within("door", TIMEOUT).await.unwrap();
     let foreign = refusal(crex.send(with(door.fence())).await);
     assert!(matches!(foreign, Refusal::StaleFence(_)), "{foreign}");
     let mut invented = with(None);
@@ -628,7 +628,7 @@ async fn actions_of_a_robot_on_another_host_are_invoked_and_cancelled() {
     );
     assert!(refused, "{wrong:?}");
     let mut goal = crex.invoke("drive", &()).await.unwrap();
-    assert!(goal.cancel(PATIENCE).await.unwrap());
+    assert!(goal.cancel(TIMEOUT).await.unwrap());
     assert_eq!(crex.status().await.unwrap(), []);
     near.close().await;
     near_gateway.close().await;
@@ -683,6 +683,6 @@ fn blocking_calls_do_the_same() {
     let docked: Docked = goal.result().unwrap();
     assert_eq!(docked.charge, 1.5);
     let mut goal = crex.invoke("drive", &()).unwrap();
-    assert!(goal.cancel(PATIENCE).unwrap());
+    assert!(goal.cancel(TIMEOUT).unwrap());
     assert_eq!(crex.status().unwrap(), []);
 }

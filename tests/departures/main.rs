@@ -1,7 +1,7 @@
 //! Partners that leave or die, and hosts that become silent, during a conversation. The partners are
 //! processes of their own, which the tests kill with SIGKILL or stop with SIGSTOP.
 //!
-//! Every call has a patience of one minute, its own or that of `patient`. A call that waits for it fails the
+//! Every call has a timeout of one minute, its own or that of `patient`. A call that waits for it fails the
 //! test with another error.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
@@ -19,7 +19,7 @@ use process::Process;
 use rustix::process::Signal;
 
 /// Time limit of all calls, which a passing test does not reach.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 #[test]
 #[ignore = "started by the other tests"]
@@ -27,9 +27,9 @@ fn process_entry() {
     process::run();
 }
 
-/// Waits for a result of a call that has no patience of its own.
+/// Waits for a result of a call that has no timeout of its own.
 async fn patient<T>(call: impl Future<Output = T>) -> T {
-    let ended = tokio::time::timeout(PATIENCE, call).await;
+    let ended = tokio::time::timeout(TIMEOUT, call).await;
     ended.expect("the call has not ended")
 }
 
@@ -71,41 +71,39 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
     let mut arm = Process::start("arm", &host);
     let ask = |act| to(&rover, act, "arm");
 
-    let request = rover.request(ask(Performative::Request), PATIENCE).await;
+    let request = rover.request(ask(Performative::Request), TIMEOUT).await;
     let mut request = request.unwrap();
     assert!(request.agreed().await.unwrap());
-    let query = rover.query(ask(Performative::QueryRef), PATIENCE).await;
-    let when = rover.request_when(ask(Performative::RequestWhen), PATIENCE);
+    let query = rover.query(ask(Performative::QueryRef), TIMEOUT).await;
+    let when = rover.request_when(ask(Performative::RequestWhen), TIMEOUT);
     let when = when.await.unwrap();
-    let charge = rover
-        .subscribe(ask(Performative::Subscribe), PATIENCE)
-        .await;
+    let charge = rover.subscribe(ask(Performative::Subscribe), TIMEOUT).await;
     let mut charge = charge.unwrap();
     assert_eq!(text(&patient(charge.next()).await.unwrap()), "first");
-    let proxy = rover.brokering(ask(Performative::Proxy), PATIENCE).await;
+    let proxy = rover.brokering(ask(Performative::Proxy), TIMEOUT).await;
     let mut proxied = proxy.unwrap();
     let arms = [AgentId::new("arm").unwrap()];
     let call = rover.message(Performative::Cfp);
-    let mut net = rover.contract_net(call, &arms, PATIENCE).await.unwrap();
+    let mut net = rover.contract_net(call, &arms, TIMEOUT).await.unwrap();
     let bid = net.bids().proposals[0].clone();
     let opening = rover.message(Performative::Inform);
     let mut auction = rover.english_auction(opening, &arms).await.unwrap();
-    let to_cancel = rover.request(ask(Performative::Request), PATIENCE).await;
+    let to_cancel = rover.request(ask(Performative::Request), TIMEOUT).await;
     let mut to_cancel = to_cancel.unwrap();
     assert!(to_cancel.agreed().await.unwrap());
 
     let proposing = Arc::clone(&rover);
     let proposed = tokio::spawn(async move {
         let proposal = to(&proposing, Performative::Propose, "arm");
-        let decided = proposing.propose(proposal, PATIENCE).await;
+        let decided = proposing.propose(proposal, TIMEOUT).await;
         (decided, Instant::now())
     });
     let awarded = tokio::spawn(async move {
-        let awarded = net.award(&[bid], "", PATIENCE).await;
+        let awarded = net.award(&[bid], "", TIMEOUT).await;
         (awarded, Instant::now())
     });
     let called = tokio::spawn(async move {
-        let bids = auction.call("10", PATIENCE).await;
+        let bids = auction.call("10", TIMEOUT).await;
         (bids, Instant::now(), auction)
     });
     let notified = tokio::spawn(async move {
@@ -113,7 +111,7 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
         (notified, Instant::now(), charge)
     });
     let answered = tokio::spawn(async move {
-        let answered = proxied.next(PATIENCE).await;
+        let answered = proxied.next(TIMEOUT).await;
         (answered, Instant::now())
     });
     let informed = tokio::spawn(async move {
@@ -154,7 +152,7 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
     times.push(("proxied", at));
     gone(&query.unwrap().result().await, "arm");
     gone(&when.result().await, "arm");
-    assert!(to_cancel.cancel(PATIENCE).await.is_err());
+    assert!(to_cancel.cancel(TIMEOUT).await.is_err());
     for (call, at) in times {
         println!(
             "{call}: {:?} after the kill",
@@ -173,10 +171,10 @@ fn a_killed_partner_ends_a_blocking_call() {
     let lift = rover
         .message(Performative::Request)
         .receiver(receiver.clone());
-    let mut request = rover.request(lift, PATIENCE).unwrap();
+    let mut request = rover.request(lift, TIMEOUT).unwrap();
     assert!(request.agreed().unwrap());
     let charge = rover.message(Performative::Subscribe).receiver(receiver);
-    let mut charge = rover.subscribe(charge, PATIENCE).unwrap();
+    let mut charge = rover.subscribe(charge, TIMEOUT).unwrap();
     assert_eq!(text(&charge.next().unwrap()), "first");
     let waiting = std::thread::spawn(move || charge.next());
     arm.kill();
@@ -207,7 +205,7 @@ async fn an_agent_that_leaves_or_registers_again_is_gone() {
     for registers_again in [false, true] {
         let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
-        let mut request = rover.request(request, PATIENCE).await.unwrap();
+        let mut request = rover.request(request, TIMEOUT).await.unwrap();
         let first = patient(arm.receive()).await.unwrap();
         let mut task = arm.take_part(&first).unwrap();
         task.agree("").await.unwrap();
@@ -232,7 +230,7 @@ async fn an_answer_that_precedes_the_end_of_its_sender_counts() {
     for _ in 0..20 {
         let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
-        let request = rover.request(request, PATIENCE).await.unwrap();
+        let request = rover.request(request, TIMEOUT).await.unwrap();
         let first = patient(arm.receive()).await.unwrap().into_message();
         let done = arm.reply(&first, Performative::Inform).content("done");
         arm.send(done.build().unwrap()).await.unwrap();
@@ -279,7 +277,7 @@ impl TwoHosts {
         let process = Process::start(name, &self.there);
         let started = Instant::now();
         while self.domain.directory().lookup(name).is_none() {
-            assert!(started.elapsed() < PATIENCE, "{name} was not found");
+            assert!(started.elapsed() < TIMEOUT, "{name} was not found");
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
         process
@@ -292,10 +290,10 @@ async fn a_killed_partner_on_another_host_ends_the_call() {
     let mut arm = hosts.agent("arm").await;
     let rover = hosts.domain.register("rover").await.unwrap();
     let request = to(&rover, Performative::Request, "arm");
-    let mut request = rover.request(request, PATIENCE).await.unwrap();
+    let mut request = rover.request(request, TIMEOUT).await.unwrap();
     assert!(request.agreed().await.unwrap());
     let charge = to(&rover, Performative::Subscribe, "arm");
-    let mut charge = rover.subscribe(charge, PATIENCE).await.unwrap();
+    let mut charge = rover.subscribe(charge, TIMEOUT).await.unwrap();
     assert_eq!(text(&patient(charge.next()).await.unwrap()), "first");
     let waiting = tokio::spawn(async move { patient(charge.next()).await });
     let mut partners = rover.watch_partners();
@@ -319,14 +317,14 @@ async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
     let mut arm = hosts.agent("arm").await;
     let rover = Arc::new(hosts.domain.register("rover").await.unwrap());
     let request = to(&rover, Performative::Request, "arm");
-    let mut request = rover.request(request, PATIENCE).await.unwrap();
+    let mut request = rover.request(request, TIMEOUT).await.unwrap();
     assert!(request.agreed().await.unwrap());
     let mut reachability = request.reachability();
     assert!(reachability.unreachable().is_empty());
     let short = to(&rover, Performative::Request, "arm");
     let short = rover.request(short, Duration::from_secs(5)).await.unwrap();
     let charge = to(&rover, Performative::Subscribe, "arm");
-    let mut charge = rover.subscribe(charge, PATIENCE).await.unwrap();
+    let mut charge = rover.subscribe(charge, TIMEOUT).await.unwrap();
     assert_eq!(text(&patient(charge.next()).await.unwrap()), "first");
 
     hosts.far.signal(Signal::STOP);
@@ -340,7 +338,7 @@ async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
     let is_silence =
         matches!(&silence, Err(DialogueError::Unreachable { agent, .. }) if agent == "arm");
     assert!(is_silence, "{silence:?}");
-    // The patience of this request ends first.
+    // The timeout of this request ends first.
     let impatient = impatient.await.unwrap();
     let is_silence = matches!(impatient, Err(DialogueError::Unreachable { .. }));
     assert!(is_silence, "{impatient:?}");

@@ -54,13 +54,13 @@ fn a_request_is_answered_and_another_cancelled() {
         },
         |rover| {
             let lift = to_arm(rover, Performative::Request);
-            let mut request = rover.request(lift.clone(), PATIENCE).unwrap();
+            let mut request = rover.request(lift.clone(), TIMEOUT).unwrap();
             assert!(request.agreed().unwrap());
             assert_eq!(text(&request.result().unwrap()), "lifted");
-            let mut request = rover.request(lift, PATIENCE).unwrap();
+            let mut request = rover.request(lift, TIMEOUT).unwrap();
             assert!(!request.conversation_id().is_empty());
             assert!(request.agreed().unwrap());
-            assert!(request.cancel(PATIENCE).unwrap());
+            assert!(request.cancel(TIMEOUT).unwrap());
         },
     );
     assert!(asked > 0);
@@ -86,23 +86,23 @@ fn query_request_when_propose_and_subscribe() {
             let mut task = arm.take_part(&first).unwrap();
             task.agree("").unwrap();
             task.inform("pose").unwrap();
-            assert!(task.cancelled(PATIENCE).unwrap());
+            assert!(task.cancelled(TIMEOUT).unwrap());
             task.confirm_cancel().unwrap();
         },
         |rover| {
             let query = to_arm(rover, Performative::QueryRef);
-            let result = rover.query(query, PATIENCE).unwrap().result();
+            let result = rover.query(query, TIMEOUT).unwrap().result();
             assert_eq!(text(&result.unwrap()), "42");
             let when = to_arm(rover, Performative::RequestWhen);
-            let result = rover.request_when(when, PATIENCE).unwrap().result();
+            let result = rover.request_when(when, TIMEOUT).unwrap().result();
             assert!(matches!(result, Err(DialogueError::Failed(_))));
             let propose = to_arm(rover, Performative::Propose);
-            let decided = rover.propose(propose, PATIENCE).unwrap();
+            let decided = rover.propose(propose, TIMEOUT).unwrap();
             assert!(matches!(decided, Decision::Accepted(_)));
             let subscribe = to_arm(rover, Performative::Subscribe);
-            let mut poses = rover.subscribe(subscribe, PATIENCE).unwrap();
+            let mut poses = rover.subscribe(subscribe, TIMEOUT).unwrap();
             assert_eq!(text(&poses.next().unwrap()), "pose");
-            poses.cancel(PATIENCE).unwrap();
+            poses.cancel(TIMEOUT).unwrap();
         },
     );
 }
@@ -112,28 +112,28 @@ fn contract_nets() {
     between(
         |arm, first| {
             let mut task = arm.take_part(first).unwrap();
-            assert!(task.propose("10", PATIENCE).unwrap());
+            assert!(task.propose("10", TIMEOUT).unwrap());
             task.reply(Reply::Inform("done".into())).unwrap();
             let call = arm.receive().unwrap();
             let mut task = arm.take_part(&call).unwrap();
-            assert!(!task.propose("10", PATIENCE).unwrap());
-            assert!(task.next_call(PATIENCE).unwrap().is_some());
-            let cancelled = task.propose("9", PATIENCE);
+            assert!(!task.propose("10", TIMEOUT).unwrap());
+            assert!(task.next_call(TIMEOUT).unwrap().is_some());
+            let cancelled = task.propose("9", TIMEOUT);
             assert!(matches!(cancelled, Err(DialogueError::Cancelled(_))));
             task.confirm_cancel().unwrap();
         },
         |rover| {
             let call = || rover.message(Performative::Cfp);
-            let mut net = rover.contract_net(call(), &arm(), PATIENCE).unwrap();
+            let mut net = rover.contract_net(call(), &arm(), TIMEOUT).unwrap();
             let bids = net.bids().proposals.clone();
-            let results = net.award(&bids, "", PATIENCE).unwrap();
+            let results = net.award(&bids, "", TIMEOUT).unwrap();
             assert_eq!(text(results[0].result.as_ref().unwrap()), "done");
-            let net = rover.iterated_contract_net(call(), &arm(), PATIENCE);
+            let net = rover.iterated_contract_net(call(), &arm(), TIMEOUT);
             let mut net = net.unwrap();
             let bids = net.bids().proposals.clone();
-            net.call_again(&bids, call(), PATIENCE).unwrap();
+            net.call_again(&bids, call(), TIMEOUT).unwrap();
             assert_eq!(text(&net.bids().proposals[0]), "9");
-            net.cancel(PATIENCE).unwrap();
+            net.cancel(TIMEOUT).unwrap();
         },
     );
 }
@@ -143,24 +143,24 @@ fn auctions() {
     let asked = between(
         |arm, first| {
             let mut task = arm.take_part(first).unwrap();
-            assert!(task.next_call(PATIENCE).unwrap().is_some());
-            assert!(task.propose("", PATIENCE).unwrap());
-            assert!(task.next_call(PATIENCE).unwrap().is_none());
+            assert!(task.next_call(TIMEOUT).unwrap().is_some());
+            assert!(task.propose("", TIMEOUT).unwrap());
+            assert!(task.next_call(TIMEOUT).unwrap().is_none());
             let opening = arm.receive().unwrap();
             let mut second = arm.take_part(&opening).unwrap();
-            assert!(second.next_call(PATIENCE).unwrap().is_some());
-            assert!(second.propose("", PATIENCE).unwrap());
-            assert!(second.next_call(PATIENCE).unwrap().is_none());
-            text(&second.next(PATIENCE).unwrap()).to_owned()
+            assert!(second.next_call(TIMEOUT).unwrap().is_some());
+            assert!(second.propose("", TIMEOUT).unwrap());
+            assert!(second.next_call(TIMEOUT).unwrap().is_none());
+            text(&second.next(TIMEOUT).unwrap()).to_owned()
         },
         |rover| {
             let opening = || rover.message(Performative::Inform).content("a crate");
             let mut auction = rover.dutch_auction(opening(), &arm()).unwrap();
-            let bids = auction.call("10", PATIENCE).unwrap();
+            let bids = auction.call("10", TIMEOUT).unwrap();
             auction.accept(&bids.proposals[0], "").unwrap();
             auction.close("").unwrap();
             let mut auction = rover.english_auction(opening(), &arm()).unwrap();
-            let bids = auction.call("10", PATIENCE).unwrap();
+            let bids = auction.call("10", TIMEOUT).unwrap();
             auction.accept(&bids.proposals[0], "").unwrap();
             auction.close("").unwrap();
             assert_eq!(auction.leader().unwrap().name(), "arm");
@@ -182,7 +182,7 @@ fn brokering_and_recruiting() {
             };
             let mut task = broker.take_part(first).unwrap();
             task.agree("").unwrap();
-            let early = task.next_answer(PATIENCE).unwrap();
+            let early = task.next_answer(TIMEOUT).unwrap();
             assert!(early.is_none(), "no message was passed on");
             task.inform("passed on").unwrap();
             let answer = broker.message(Performative::Confirm).build().unwrap();
@@ -190,15 +190,15 @@ fn brokering_and_recruiting() {
             let second = broker.receive().unwrap();
             let mut task = broker.take_part(&second).unwrap();
             task.agree("").unwrap();
-            task.pass_on(query(), PATIENCE).unwrap();
+            task.pass_on(query(), TIMEOUT).unwrap();
             task.inform("recruited").unwrap();
         },
         |rover| {
             let proxy = || to_arm(rover, Performative::Proxy);
-            let mut answers = rover.brokering(proxy(), PATIENCE).unwrap();
-            let answer = answers.next(PATIENCE).unwrap();
+            let mut answers = rover.brokering(proxy(), TIMEOUT).unwrap();
+            let answer = answers.next(TIMEOUT).unwrap();
             assert_eq!(*answer.performative(), Performative::Confirm);
-            let answers = rover.recruiting(proxy(), PATIENCE);
+            let answers = rover.recruiting(proxy(), TIMEOUT);
             drop(answers.unwrap());
         },
     );

@@ -29,11 +29,11 @@ use fipa::{
 };
 
 /// Time limit of all calls, which a passing test does not reach.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Waits for the next message of an agent. The test fails if none arrives.
 async fn next_message(agent: &Agent) -> Result<Incoming, ReceiveError> {
-    let received = tokio::time::timeout(PATIENCE, agent.receive()).await;
+    let received = tokio::time::timeout(TIMEOUT, agent.receive()).await;
     received.unwrap_or_else(|_| panic!("no message for {}", agent.name()))
 }
 
@@ -91,7 +91,7 @@ async fn a_request_is_agreed_to_and_answered() {
     let (rover, arm) = pair(&["monitor.check=enforce"]).await;
     let initiator = async {
         let lift = to(&rover, Performative::Request, &arm, "lift");
-        let mut request = rover.request(lift, PATIENCE).await.unwrap();
+        let mut request = rover.request(lift, TIMEOUT).await.unwrap();
         assert!(request.agreed().await.unwrap());
         assert_eq!(text(&request.result().await.unwrap()), "lifted");
     };
@@ -114,31 +114,31 @@ async fn each_kind_of_answer_yields_its_result_or_error() {
     let (rover, arm) = pair(&[]).await;
     let initiator = async {
         let ask = |act| to(&rover, act, &arm, "?");
-        let request = rover.request(ask(Performative::Request), PATIENCE).await;
+        let request = rover.request(ask(Performative::Request), TIMEOUT).await;
         let refused = request.unwrap().result().await;
         assert!(matches!(&refused, Err(DialogueError::Refused(why)) if text(why) == "busy"));
         // The participant answers without an `agree`.
-        let query = rover.query(ask(Performative::QueryRef), PATIENCE).await;
+        let query = rover.query(ask(Performative::QueryRef), TIMEOUT).await;
         let mut query = query.unwrap();
         assert!(!query.agreed().await.unwrap());
         assert_eq!(text(&query.result().await.unwrap()), "42");
         let when = rover
-            .request_when(ask(Performative::RequestWhen), PATIENCE)
+            .request_when(ask(Performative::RequestWhen), TIMEOUT)
             .await;
         let mut when = when.unwrap();
         assert!(when.agreed().await.unwrap());
         assert!(matches!(when.result().await, Err(DialogueError::Failed(_))));
-        let decided = rover.propose(ask(Performative::Propose), PATIENCE).await;
+        let decided = rover.propose(ask(Performative::Propose), TIMEOUT).await;
         assert!(matches!(decided, Ok(Decision::Accepted(_))));
-        let decided = rover.propose(ask(Performative::Propose), PATIENCE).await;
+        let decided = rover.propose(ask(Performative::Propose), TIMEOUT).await;
         assert!(matches!(decided, Ok(Decision::Rejected(_))));
         // A message that does not begin the protocol is not sent.
-        let wrong = rover.request(ask(Performative::Inform), PATIENCE).await;
+        let wrong = rover.request(ask(Performative::Inform), TIMEOUT).await;
         assert!(matches!(wrong, Err(DialogueError::WouldViolate(_))));
         let to_unknown = rover
             .message(Performative::Request)
             .receiver(AgentId::new("unknown").unwrap());
-        let unknown = rover.request(to_unknown, PATIENCE).await;
+        let unknown = rover.request(to_unknown, TIMEOUT).await;
         assert!(matches!(unknown, Err(DialogueError::NotDelivered { .. })));
     };
     let participant = async {
@@ -191,7 +191,7 @@ async fn missing_and_invalid_answers_are_errors() {
         }
         other => panic!("{other:?}"),
     }
-    let request = rover.request(lift(), PATIENCE).await.unwrap();
+    let request = rover.request(lift(), TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     let answer = arm
         .reply(&first, Performative::NotUnderstood)
@@ -201,7 +201,7 @@ async fn missing_and_invalid_answers_are_errors() {
     let result = request.result().await;
     assert!(matches!(result, Err(DialogueError::NotUnderstood(_))));
     // A reply that violates the protocol is not sent.
-    let _request = rover.request(lift(), PATIENCE).await.unwrap();
+    let _request = rover.request(lift(), TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap();
     let wrong = respond(&arm, &first, async |_| Ok(Reply::Accept("".into()))).await;
     assert!(matches!(wrong, Err(DialogueError::WouldViolate(_))));
@@ -211,7 +211,7 @@ async fn missing_and_invalid_answers_are_errors() {
 async fn other_messages_are_received_during_a_conversation() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift, PATIENCE).await.unwrap();
+    let request = rover.request(lift, TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap();
     for number in 0..5 {
         let note = to(&arm, Performative::Inform, &rover, &number.to_string());
@@ -238,8 +238,8 @@ async fn a_conversation_blocked_by_unread_messages_ends_with_the_domain() {
     let (rover, arm) = pair(&[]).await;
     let initiator = async {
         let subscribe = to(&rover, Performative::Subscribe, &arm, "pose");
-        let mut poses = rover.subscribe(subscribe, PATIENCE).await.unwrap();
-        tokio::time::timeout(PATIENCE, poses.next()).await.unwrap()
+        let mut poses = rover.subscribe(subscribe, TIMEOUT).await.unwrap();
+        tokio::time::timeout(TIMEOUT, poses.next()).await.unwrap()
     };
     let participant = async {
         let first = next_message(&arm).await.unwrap();
@@ -264,11 +264,11 @@ async fn a_subscription_goes_on_until_it_is_cancelled() {
     let (rover, arm) = pair(&["monitor.check=enforce"]).await;
     let initiator = async {
         let subscribe = to(&rover, Performative::Subscribe, &arm, "pose");
-        let mut poses = rover.subscribe(subscribe, PATIENCE).await.unwrap();
+        let mut poses = rover.subscribe(subscribe, TIMEOUT).await.unwrap();
         for number in 0..10 {
             assert_eq!(text(&poses.next().await.unwrap()), number.to_string());
         }
-        poses.cancel(PATIENCE).await.unwrap();
+        poses.cancel(TIMEOUT).await.unwrap();
     };
     let participant = async {
         let first = next_message(&arm).await.unwrap();
@@ -290,9 +290,9 @@ async fn a_request_is_cancelled() {
     let (rover, arm) = pair(&[]).await;
     let initiator = async {
         let lift = to(&rover, Performative::Request, &arm, "lift");
-        let mut request = rover.request(lift, PATIENCE).await.unwrap();
+        let mut request = rover.request(lift, TIMEOUT).await.unwrap();
         assert!(request.agreed().await.unwrap());
-        assert!(request.cancel(PATIENCE).await.unwrap());
+        assert!(request.cancel(TIMEOUT).await.unwrap());
     };
     let participant = async {
         let first = next_message(&arm).await.unwrap();
@@ -323,7 +323,7 @@ async fn a_contract_net_with_several_participants() {
         let bid = async |arm: &Agent, price: &'static str| {
             let call = next_message(arm).await.unwrap();
             respond(arm, &call, async |task| {
-                if task.propose(price, PATIENCE).await? {
+                if task.propose(price, TIMEOUT).await? {
                     return Ok(Reply::Inform("carried".into()));
                 }
                 Ok(Reply::Nothing)
@@ -340,14 +340,14 @@ async fn a_contract_net_with_several_participants() {
     };
     let initiator = async {
         let call = rover.message(Performative::Cfp).content("carry");
-        let mut net = rover.contract_net(call, &called, PATIENCE).await.unwrap();
+        let mut net = rover.contract_net(call, &called, TIMEOUT).await.unwrap();
         let bids = net.bids().clone();
         assert_eq!(bids.refusals.len(), 1, "{bids:?}");
         assert_eq!(bids.silent, ["unknown"]);
         assert_eq!(bids.unreached, ["unknown"]);
         let cheap = bids.proposals.iter().find(|bid| text(bid) == "10");
         let cheap = cheap.unwrap().clone();
-        let results = net.award(&[cheap], "", PATIENCE).await.unwrap();
+        let results = net.award(&[cheap], "", TIMEOUT).await.unwrap();
         assert_eq!(results.len(), 1);
         assert_eq!(results[0].agent, "cheap");
         assert_eq!(text(results[0].result.as_ref().unwrap()), "carried");
@@ -497,7 +497,7 @@ async fn protocols_of_the_configuration_are_read_and_checked() {
     let mut task = arm.take_part(&first).unwrap();
     let inform = message(&rover, Performative::Inform, &arm);
     rover.send(inform).await.unwrap();
-    let second = task.next(PATIENCE).await.unwrap();
+    let second = task.next(TIMEOUT).await.unwrap();
     assert_eq!(*second.performative(), Performative::Inform);
     assert_eq!(task.state(), "cancelling");
 

@@ -20,7 +20,7 @@ async fn bid(arm: &Agent) {
     let call = next_message(arm).await.unwrap();
     let name = arm.name().to_owned();
     respond(arm, &call, async |task| {
-        Ok(match task.propose(name, PATIENCE).await? {
+        Ok(match task.propose(name, TIMEOUT).await? {
             true => Reply::Inform("carried".into()),
             false => Reply::Nothing,
         })
@@ -58,7 +58,7 @@ async fn a_contract_net_reaches_the_members_of_patterns_and_coalitions_once() {
         let initiator = async {
             let call = rover.message(Performative::Cfp);
             let receivers = ids(receivers);
-            let net = rover.contract_net(call, &receivers, PATIENCE);
+            let net = rover.contract_net(call, &receivers, TIMEOUT);
             let mut net = net.await.unwrap();
             let called: Vec<&str> = net.called().iter().map(AgentId::name).collect();
             assert_eq!(called, members);
@@ -69,7 +69,7 @@ async fn a_contract_net_reaches_the_members_of_patterns_and_coalitions_once() {
             proposals.sort_unstable();
             expected.sort_unstable();
             assert_eq!(proposals, expected);
-            let awarded = net.award(&bids.proposals, "", PATIENCE).await.unwrap();
+            let awarded = net.award(&bids.proposals, "", TIMEOUT).await.unwrap();
             assert_eq!(awarded.len(), members.len());
             assert!(awarded.iter().all(|awarded| awarded.result.is_ok()));
         };
@@ -106,16 +106,16 @@ async fn an_auction_reaches_the_members_of_a_coalition() {
     let bidder = async |arm: &Agent| {
         let opening = next_message(arm).await.unwrap();
         let mut task = arm.take_part(&opening).unwrap();
-        assert!(task.next_call(PATIENCE).await.unwrap().is_some());
-        task.propose("", PATIENCE).await.unwrap();
-        while task.next_call(PATIENCE).await.unwrap().is_some() {}
+        assert!(task.next_call(TIMEOUT).await.unwrap().is_some());
+        task.propose("", TIMEOUT).await.unwrap();
+        while task.next_call(TIMEOUT).await.unwrap().is_some() {}
     };
     let auctioneer = async {
         let opening = rover.message(Performative::Inform);
         let to = ids(&["platoon", "arm_1"]);
         let mut auction = rover.english_auction(opening, &to).await.unwrap();
         assert_eq!(auction.bidders(), ids(&["arm_1", "arm_2"]));
-        let bids = auction.call("10", PATIENCE).await.unwrap();
+        let bids = auction.call("10", TIMEOUT).await.unwrap();
         assert_eq!(bids.proposals.len(), 2, "{bids:?}");
         auction.accept(&bids.proposals[0], "").await.unwrap();
         auction.close("").await.unwrap();
@@ -167,28 +167,28 @@ async fn a_request_needs_receivers_that_stand_for_one_agent() {
         let to = |act| rover.message(act).receivers(ids(&[several]));
         let refused = [
             rover
-                .request(to(Performative::Request), PATIENCE)
+                .request(to(Performative::Request), TIMEOUT)
                 .await
                 .err(),
-            rover.query(to(Performative::QueryIf), PATIENCE).await.err(),
+            rover.query(to(Performative::QueryIf), TIMEOUT).await.err(),
             rover
-                .request_when(to(Performative::RequestWhen), PATIENCE)
-                .await
-                .err(),
-            rover
-                .propose(to(Performative::Propose), PATIENCE)
+                .request_when(to(Performative::RequestWhen), TIMEOUT)
                 .await
                 .err(),
             rover
-                .subscribe(to(Performative::Subscribe), PATIENCE)
+                .propose(to(Performative::Propose), TIMEOUT)
                 .await
                 .err(),
             rover
-                .brokering(to(Performative::Proxy), PATIENCE)
+                .subscribe(to(Performative::Subscribe), TIMEOUT)
                 .await
                 .err(),
             rover
-                .recruiting(to(Performative::Proxy), PATIENCE)
+                .brokering(to(Performative::Proxy), TIMEOUT)
+                .await
+                .err(),
+            rover
+                .recruiting(to(Performative::Proxy), TIMEOUT)
                 .await
                 .err(),
         ];
@@ -201,7 +201,7 @@ async fn a_request_needs_receivers_that_stand_for_one_agent() {
     }
     for one in ["led", ".*_2"] {
         let lift = rover.message(Performative::Request).receivers(ids(&[one]));
-        let request = rover.request(lift, PATIENCE).await.unwrap();
+        let request = rover.request(lift, TIMEOUT).await.unwrap();
         let first = next_message(&arms[1]).await.unwrap();
         respond(&arms[1], &first, async |_| Ok(Reply::Inform("done".into())))
             .await
@@ -246,7 +246,7 @@ async fn only_a_message_that_opens_a_protocol_becomes_a_task() {
 async fn a_dropped_task_tells_its_initiator() {
     let (rover, arm) = pair(&["monitor.check=enforce"]).await;
     let ask = async |act| {
-        let request = rover.request(to(&rover, act, &arm, "lift"), PATIENCE);
+        let request = rover.request(to(&rover, act, &arm, "lift"), TIMEOUT);
         let request = request.await.unwrap();
         let first = next_message(&arm).await.unwrap();
         (request, arm.take_part(&first).unwrap())
@@ -282,7 +282,7 @@ async fn a_dropped_task_tells_its_initiator() {
     let initiator = async {
         let call = rover.message(Performative::Cfp);
         let arms = ids(&["arm"]);
-        let net = rover.contract_net(call, &arms, PATIENCE);
+        let net = rover.contract_net(call, &arms, TIMEOUT);
         let mut net = net.await.unwrap();
         let bid = net.bids().proposals.clone();
         is_dropped.await.unwrap();
@@ -297,7 +297,7 @@ async fn next_in(
     net: &mut fipa::protocol::ContractNet,
     bids: &[Message],
 ) -> Result<Message, DialogueError> {
-    let mut awarded = net.award(bids, "", PATIENCE).await?;
+    let mut awarded = net.award(bids, "", TIMEOUT).await?;
     awarded.remove(0).result
 }
 
@@ -338,7 +338,7 @@ async fn a_server_runs_a_handler_for_each_opening() {
     let ask = async |content: &str| {
         let request = to(&rover, Performative::Request, &arm, content);
         rover
-            .request(request, PATIENCE)
+            .request(request, TIMEOUT)
             .await
             .unwrap()
             .result()
@@ -363,7 +363,7 @@ async fn a_server_runs_a_handler_for_each_opening() {
     assert_eq!(text(next_message(&arm).await.unwrap().message()), "note");
     assert!(server.running() <= 1);
     drop(arm);
-    let ended = tokio::time::timeout(PATIENCE, server.ended()).await;
+    let ended = tokio::time::timeout(TIMEOUT, server.ended()).await;
     ended.unwrap();
 }
 
@@ -386,7 +386,7 @@ async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
     ];
     let subscribe = async |agent: &Agent, topic: &str| {
         let subscribe = to(agent, Performative::Subscribe, &battery, topic);
-        agent.subscribe(subscribe, PATIENCE).await
+        agent.subscribe(subscribe, TIMEOUT).await
     };
     assert_eq!(charge.publish("100").await, 0);
     let mut at_rover = subscribe(&rover, "charge").await.unwrap();
@@ -396,7 +396,7 @@ async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
     let unserved = tokio::spawn(async move {
         let battery = AgentId::new("battery").unwrap();
         let heat = other.message(Performative::Subscribe).receiver(battery);
-        let _ = other.subscribe(heat.content("heat"), PATIENCE).await;
+        let _ = other.subscribe(heat.content("heat"), TIMEOUT).await;
     });
     let heat = next_message(&battery).await.unwrap().into_message();
     assert_eq!(text(&heat), "heat");
@@ -407,7 +407,7 @@ async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
     assert_eq!(charge.names(), ["leaver", "quitter", "rover"]);
     assert_eq!(charge.publish("99").await, 3);
     assert_eq!(text(&at_rover.next().await.unwrap()), "99");
-    at_quitter.cancel(PATIENCE).await.unwrap();
+    at_quitter.cancel(TIMEOUT).await.unwrap();
     until_async("one has cancelled", || charge.subscribers() == 2).await;
     drop(leaver);
     until_async("one is gone", || charge.subscribers() == 1).await;
@@ -437,7 +437,7 @@ async fn a_message_of_an_outsider_never_reaches_a_conversation() {
     let (rover, arm) = pair(&[]).await;
     let mallory = arm.domain().register("mallory").await.unwrap();
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift, PATIENCE).await.unwrap();
+    let request = rover.request(lift, TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap();
     let id = request.conversation_id().to_owned();
     for act in [Performative::Inform, Performative::Failure] {
@@ -463,7 +463,7 @@ async fn a_message_of_an_outsider_never_reaches_a_conversation() {
     assert_eq!(text(&result.unwrap()), "done");
     // A conversation that mallory begins with the same id exists beside it.
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift, PATIENCE).await.unwrap();
+    let request = rover.request(lift, TIMEOUT).await.unwrap();
     let opening = to(&mallory, Performative::Request, &rover, "open")
         .protocol("fipa-request")
         .conversation_id(request.conversation_id());
@@ -489,7 +489,7 @@ async fn an_application_watches_the_partners_of_its_own_conversations() {
     // The departure precedes the look-up.
     drop(arm);
     partners.add("arm");
-    let event = tokio::time::timeout(PATIENCE, partners.next()).await;
+    let event = tokio::time::timeout(TIMEOUT, partners.next()).await;
     let agent = "arm".to_owned();
     assert_eq!(event.unwrap(), PartnerEvent::Gone { agent });
 }

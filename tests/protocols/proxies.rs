@@ -47,33 +47,33 @@ async fn a_broker_forwards_answers() {
     let [rover, broker, arm] = three("broker").await;
     let initiator = async {
         let proxy = proxy(&rover, &broker);
-        let mut answers = rover.brokering(proxy, PATIENCE).await.unwrap();
-        let agreed = answers.next(PATIENCE).await.unwrap();
+        let mut answers = rover.brokering(proxy, TIMEOUT).await.unwrap();
+        let agreed = answers.next(TIMEOUT).await.unwrap();
         assert_eq!(*agreed.performative(), Performative::Agree);
-        let informed = answers.next(PATIENCE).await.unwrap();
+        let informed = answers.next(TIMEOUT).await.unwrap();
         assert_eq!(*informed.performative(), Performative::Inform);
         assert_eq!(informed.sender().unwrap().name(), "broker");
         assert_eq!(text(&informed), "42");
         assert_eq!(informed.language(), Some("fipa-sl"));
-        let failed = answers.next(PATIENCE).await;
+        let failed = answers.next(TIMEOUT).await;
         assert!(matches!(&failed, Err(DialogueError::Failed(why)) if text(why) == "no more"));
     };
     let goes_between = async {
         let first = next_message(&broker).await.unwrap();
         let mut task = broker.take_part(&first).unwrap();
         // It cannot pass a message on before it has agreed.
-        let early = task.pass_on(query(&broker, "arm"), PATIENCE).await;
+        let early = task.pass_on(query(&broker, "arm"), TIMEOUT).await;
         assert!(matches!(early, Err(DialogueError::WouldViolate(_))));
         task.agree("").await.unwrap();
         // What was not delivered may be sent again.
         for _ in 0..2 {
-            let lost = task.pass_on(query(&broker, "unknown"), PATIENCE).await;
+            let lost = task.pass_on(query(&broker, "unknown"), TIMEOUT).await;
             assert!(matches!(lost, Err(DialogueError::NotDelivered { .. })));
         }
-        task.pass_on(query(&broker, "arm"), PATIENCE).await.unwrap();
+        task.pass_on(query(&broker, "arm"), TIMEOUT).await.unwrap();
         task.inform("passed on").await.unwrap();
         let mut passed = 0;
-        while let Some(answer) = task.next_answer(PATIENCE).await.unwrap() {
+        while let Some(answer) = task.next_answer(TIMEOUT).await.unwrap() {
             let mut answer = answer;
             if *answer.performative() == Performative::Inform {
                 let again = broker.message(Performative::Inform).language("fipa-sl");
@@ -94,9 +94,9 @@ async fn recruited_agents_answer_the_initiator_directly() {
     let [rover, recruiter, arm] = three("recruiter").await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
-        let mut answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
+        let mut answers = rover.recruiting(proxy, TIMEOUT).await.unwrap();
         for act in [Performative::Agree, Performative::Inform] {
-            let answer = answers.next(PATIENCE).await.unwrap();
+            let answer = answers.next(TIMEOUT).await.unwrap();
             assert_eq!(*answer.performative(), act);
             assert_eq!(answer.sender().unwrap().name(), "arm");
         }
@@ -108,13 +108,13 @@ async fn recruited_agents_answer_the_initiator_directly() {
         let first = next_message(&recruiter).await.unwrap();
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
-        task.pass_on(query(&recruiter, "arm"), PATIENCE)
+        task.pass_on(query(&recruiter, "arm"), TIMEOUT)
             .await
             .unwrap();
         // The answers may arrive before the report of the recruiter.
         answered.await.unwrap();
         task.inform("recruited").await.unwrap();
-        assert!(task.next_answer(PATIENCE).await.unwrap().is_none());
+        assert!(task.next_answer(TIMEOUT).await.unwrap().is_none());
     };
     let recruited = async {
         let first = answer(&arm).await;
@@ -138,14 +138,14 @@ async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
     if let Some(agent) = reply_to {
         call = call.reply_to(agent.id().clone());
     }
-    task.pass_on(call, PATIENCE).await.unwrap();
+    task.pass_on(call, TIMEOUT).await.unwrap();
     task.inform("recruited").await.unwrap();
 }
 
 async fn propose(arm: &Agent) {
     let first = next_message(arm).await.unwrap();
     respond(arm, &first, async |task| {
-        assert!(task.propose("20", PATIENCE).await?);
+        assert!(task.propose("20", TIMEOUT).await?);
         Ok(Reply::Inform(task.message().content().unwrap().clone()))
     })
     .await
@@ -157,17 +157,17 @@ async fn the_initiator_accepts_the_proposal_of_a_recruited_agent() {
     let [rover, recruiter, arm] = three("recruiter").await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
-        let mut answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
-        let proposal = answers.next(PATIENCE).await.unwrap();
+        let mut answers = rover.recruiting(proxy, TIMEOUT).await.unwrap();
+        let proposal = answers.next(TIMEOUT).await.unwrap();
         assert_eq!(*proposal.performative(), Performative::Propose);
-        let early = answers.answer(&proposal, Performative::Cfp, "", PATIENCE);
+        let early = answers.answer(&proposal, Performative::Cfp, "", TIMEOUT);
         assert!(matches!(early.await, Err(DialogueError::WouldViolate(_))));
-        let accept = answers.answer(&proposal, Performative::AcceptProposal, "do", PATIENCE);
+        let accept = answers.answer(&proposal, Performative::AcceptProposal, "do", TIMEOUT);
         accept.await.unwrap();
-        let done = answers.next(PATIENCE).await.unwrap();
+        let done = answers.next(TIMEOUT).await.unwrap();
         assert_eq!(*done.performative(), Performative::Inform);
         assert_eq!(text(&done), "do");
-        let again = answers.answer(&proposal, Performative::AcceptProposal, "", PATIENCE);
+        let again = answers.answer(&proposal, Performative::AcceptProposal, "", TIMEOUT);
         assert!(matches!(again.await, Err(DialogueError::WouldViolate(_))));
     };
     tokio::join!(initiator, recruit(&recruiter, None), propose(&arm));
@@ -178,7 +178,7 @@ async fn a_designated_receiver_accepts_the_proposal_of_a_recruited_agent() {
     let [rover, recruiter, arm, base] = enforcing(["rover", "recruiter", "arm", "base"]).await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
-        let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
+        let _answers = rover.recruiting(proxy, TIMEOUT).await.unwrap();
     };
     let designated = async {
         let proposal = next_message(&base).await.unwrap().into_message();
@@ -202,14 +202,14 @@ async fn recruited_agents_answer_the_designated_receiver() {
     let [rover, recruiter, arm, base] = enforcing(["rover", "recruiter", "arm", "base"]).await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
-        let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
+        let _answers = rover.recruiting(proxy, TIMEOUT).await.unwrap();
     };
     let goes_between = async {
         let first = next_message(&recruiter).await.unwrap();
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         let query = query(&recruiter, "arm").reply_to(base.id().clone());
-        task.pass_on(query, PATIENCE).await.unwrap();
+        task.pass_on(query, TIMEOUT).await.unwrap();
         task.inform("recruited").await.unwrap();
     };
     let designated = async {
@@ -226,9 +226,9 @@ async fn recruited_agents_answer_the_designated_receiver() {
 async fn a_broker_or_recruiter_may_refuse_or_find_no_agent() {
     let [rover, broker, _arm] = three("broker").await;
     let initiator = async {
-        let refused = rover.brokering(proxy(&rover, &broker), PATIENCE).await;
+        let refused = rover.brokering(proxy(&rover, &broker), TIMEOUT).await;
         assert!(matches!(refused.err(), Some(DialogueError::Refused(_))));
-        let none = rover.recruiting(proxy(&rover, &broker), PATIENCE).await;
+        let none = rover.recruiting(proxy(&rover, &broker), TIMEOUT).await;
         assert!(matches!(none.err(), Some(DialogueError::Failed(_))));
         let moment = Duration::from_secs(1);
         let silent = rover.brokering(proxy(&rover, &broker), moment).await;
@@ -255,17 +255,17 @@ async fn brokering_is_cancelled() {
     let [rover, broker, arm] = three("broker").await;
     let initiator = async {
         let proxy = proxy(&rover, &broker);
-        let answers = rover.brokering(proxy, PATIENCE).await.unwrap();
-        answers.cancel(PATIENCE).await.unwrap();
+        let answers = rover.brokering(proxy, TIMEOUT).await.unwrap();
+        answers.cancel(TIMEOUT).await.unwrap();
     };
     let goes_between = async {
         let first = next_message(&broker).await.unwrap();
         let mut task = broker.take_part(&first).unwrap();
         task.agree("").await.unwrap();
-        task.pass_on(query(&broker, "arm"), PATIENCE).await.unwrap();
+        task.pass_on(query(&broker, "arm"), TIMEOUT).await.unwrap();
         task.inform("passed on").await.unwrap();
         // The arm never answers.
-        let cancelled = task.next_answer(PATIENCE).await;
+        let cancelled = task.next_answer(TIMEOUT).await;
         assert!(matches!(cancelled, Err(DialogueError::Cancelled(_))));
         let nothing = task.confirm_cancel().await.unwrap();
         task.reply(nothing).await.unwrap();

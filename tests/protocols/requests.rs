@@ -15,7 +15,7 @@ async fn the_first_answer_that_ends_a_request_stays() {
     let (rover, arm) = pair(&[]).await;
     for act in [Refuse, Failure, NotUnderstood] {
         let lift = to(&rover, Performative::Request, &arm, "lift");
-        let mut request = rover.request(lift, PATIENCE).await.unwrap();
+        let mut request = rover.request(lift, TIMEOUT).await.unwrap();
         let first = next_message(&arm).await.unwrap().into_message();
         answer(&arm, &first, act.clone(), "busy").await;
         let agreed = request.agreed().await.map(|_| ());
@@ -37,7 +37,7 @@ async fn the_first_answer_that_ends_a_request_stays() {
 async fn superfluous_messages_do_not_end_a_request() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift, PATIENCE).await.unwrap();
+    let request = rover.request(lift, TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     for act in [
         Performative::Agree,
@@ -54,7 +54,7 @@ async fn superfluous_messages_do_not_end_a_request() {
 async fn a_cancel_that_is_refused_loses_no_result() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let mut request = rover.request(lift, PATIENCE).await.unwrap();
+    let mut request = rover.request(lift, TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     let refuses = async {
         let cancel = next_message(&arm).await.unwrap().into_message();
@@ -64,7 +64,7 @@ async fn a_cancel_that_is_refused_loses_no_result() {
         answer(&arm, &cancel, Performative::Failure, "too late").await;
         answer(&arm, &first, Performative::Inform, "lifted").await;
     };
-    let (cancelled, ()) = tokio::join!(request.cancel(PATIENCE), refuses);
+    let (cancelled, ()) = tokio::join!(request.cancel(TIMEOUT), refuses);
     assert!(!cancelled.unwrap());
     assert!(request.agreed().await.unwrap());
     assert_eq!(text(&request.result().await.unwrap()), "lifted");
@@ -78,17 +78,17 @@ async fn a_result_that_crosses_a_cancel_is_not_lost() {
         (Performative::Failure, "broken"),
     ] {
         let lift = to(&rover, Performative::Request, &arm, "lift");
-        let mut request = rover.request(lift, PATIENCE).await.unwrap();
+        let mut request = rover.request(lift, TIMEOUT).await.unwrap();
         let first = next_message(&arm).await.unwrap().into_message();
         let crosses = async {
             let cancel = next_message(&arm).await.unwrap().into_message();
             assert_eq!(*cancel.performative(), Performative::Cancel);
             answer(&arm, &first, act.clone(), content).await;
         };
-        let (cancelled, ()) = tokio::join!(request.cancel(PATIENCE), crosses);
+        let (cancelled, ()) = tokio::join!(request.cancel(TIMEOUT), crosses);
         assert!(!cancelled.unwrap());
         // A second cancel of an ended request sends nothing.
-        assert!(!request.cancel(PATIENCE).await.unwrap());
+        assert!(!request.cancel(TIMEOUT).await.unwrap());
         assert!(arm.try_receive().unwrap().is_none());
         let message = match request.result().await {
             Ok(message) => message,
@@ -103,7 +103,7 @@ async fn a_result_that_crosses_a_cancel_is_not_lost() {
 async fn a_confirmed_cancel_ends_a_request_although_its_wait_was_given_up() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let mut request = rover.request(lift, PATIENCE).await.unwrap();
+    let mut request = rover.request(lift, TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     answer(&arm, &first, Performative::Agree, "").await;
     let timed_out = request.cancel(Duration::from_millis(200)).await;

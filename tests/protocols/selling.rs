@@ -36,12 +36,12 @@ async fn an_iterated_contract_net_calls_some_participants_again() {
         let mut task = arm.take_part(&call).unwrap();
         let mut calls = 1;
         for price in prices {
-            if task.propose(*price, PATIENCE).await.unwrap() {
+            if task.propose(*price, TIMEOUT).await.unwrap() {
                 assert_eq!(text(task.message()), "yours");
                 task.reply(Reply::Inform("carried".into())).await.unwrap();
                 return (calls, true);
             }
-            match task.next_call(PATIENCE).await.unwrap() {
+            match task.next_call(TIMEOUT).await.unwrap() {
                 Some(call) => assert_eq!(text(&call), "cheaper?"),
                 None => return (calls, false),
             }
@@ -52,7 +52,7 @@ async fn an_iterated_contract_net_calls_some_participants_again() {
     };
     let initiator = async {
         let mut net = rover
-            .iterated_contract_net(cfp(&rover, "carry"), &called, PATIENCE)
+            .iterated_contract_net(cfp(&rover, "carry"), &called, TIMEOUT)
             .await
             .unwrap();
         assert_eq!(net.bids().proposals.len(), 3);
@@ -60,13 +60,13 @@ async fn an_iterated_contract_net_calls_some_participants_again() {
             from(&net.bids().proposals, "cheap").clone(),
             from(&net.bids().proposals, "stubborn").clone(),
         ];
-        net.call_again(&some, cfp(&rover, "cheaper?"), PATIENCE)
+        net.call_again(&some, cfp(&rover, "cheaper?"), TIMEOUT)
             .await
             .unwrap();
         let bids = net.bids().clone();
         assert_eq!((bids.proposals.len(), bids.refusals.len()), (1, 1));
         assert!(bids.silent.is_empty() && bids.violations.is_empty());
-        let results = net.award(&bids.proposals, "yours", PATIENCE).await.unwrap();
+        let results = net.award(&bids.proposals, "yours", TIMEOUT).await.unwrap();
         assert_eq!(results[0].agent, "cheap");
         assert_eq!(text(results[0].result.as_ref().unwrap()), "carried");
     };
@@ -86,20 +86,20 @@ async fn a_second_call_in_a_contract_net_is_refused() {
     let (rover, arms) = rover_and(["arm"]).await;
     let initiator = async {
         let mut net = rover
-            .contract_net(cfp(&rover, "carry"), &ids(&arms), PATIENCE)
+            .contract_net(cfp(&rover, "carry"), &ids(&arms), TIMEOUT)
             .await
             .unwrap();
         let bids = net.bids().proposals.clone();
-        let again = net.call_again(&bids, cfp(&rover, "cheaper?"), PATIENCE);
+        let again = net.call_again(&bids, cfp(&rover, "cheaper?"), TIMEOUT);
         assert!(matches!(again.await, Err(DialogueError::WouldViolate(_))));
         // The proposals can still be awarded.
-        let results = net.award(&bids, "", PATIENCE).await.unwrap();
+        let results = net.award(&bids, "", TIMEOUT).await.unwrap();
         assert!(results[0].result.is_ok());
     };
     let participant = async {
         let call = arms[0].receive().await.unwrap();
         let mut task = arms[0].take_part(&call).unwrap();
-        assert!(task.propose("10", PATIENCE).await.unwrap());
+        assert!(task.propose("10", TIMEOUT).await.unwrap());
         task.reply(Reply::Inform("done".into())).await.unwrap();
     };
     tokio::join!(initiator, participant);
@@ -126,7 +126,7 @@ async fn a_violation_by_one_participant_does_not_affect_the_others() {
         wild.send(late).await.unwrap();
         let call = next_message(tame).await.unwrap();
         let mut task = tame.take_part(&call).unwrap();
-        assert!(task.propose("10", PATIENCE).await.unwrap());
+        assert!(task.propose("10", TIMEOUT).await.unwrap());
         // Arrives while the other agent works.
         let wrong = wild
             .reply(call.message(), Performative::Agree)
@@ -137,7 +137,7 @@ async fn a_violation_by_one_participant_does_not_affect_the_others() {
     };
     let initiator = async {
         let mut net = rover
-            .contract_net(cfp(&rover, "carry"), &ids(&arms), PATIENCE)
+            .contract_net(cfp(&rover, "carry"), &ids(&arms), TIMEOUT)
             .await
             .unwrap();
         let bids = net.bids().clone();
@@ -150,7 +150,7 @@ async fn a_violation_by_one_participant_does_not_affect_the_others() {
             ("wild", ViolationKind::OutOfOrder)
         );
         let tame = from(&bids.proposals, "tame").clone();
-        let results = net.award(&[tame], "", PATIENCE).await.unwrap();
+        let results = net.award(&[tame], "", TIMEOUT).await.unwrap();
         assert_eq!(results.len(), 1);
         assert!(results[0].result.is_ok());
     };
@@ -187,18 +187,18 @@ async fn winners_do_not_wait_for_losers() {
         let call = next_message(winner).await.unwrap();
         first.await.unwrap();
         let mut task = winner.take_part(&call).unwrap();
-        assert!(task.propose("10", PATIENCE).await.unwrap());
+        assert!(task.propose("10", TIMEOUT).await.unwrap());
         task.reply(Reply::Inform("done".into())).await.unwrap();
         done.send(()).unwrap();
     };
     let initiator = async {
         let mut net = rover
-            .contract_net(cfp(&rover, "carry"), &ids(&arms), PATIENCE)
+            .contract_net(cfp(&rover, "carry"), &ids(&arms), TIMEOUT)
             .await
             .unwrap();
         let bids = net.bids().proposals.clone();
         assert_eq!(name(&bids[0]), "loser", "it is answered first");
-        let results = net.award(&bids[1..], "", PATIENCE).await.unwrap();
+        let results = net.award(&bids[1..], "", TIMEOUT).await.unwrap();
         assert_eq!(results.len(), 1);
         assert!(results[0].result.is_ok(), "{results:?}");
     };
@@ -212,7 +212,7 @@ async fn a_contract_net_is_cancelled_with_all_open_participants() {
     let waits = async {
         let call = next_message(waiting).await.unwrap();
         let mut task = waiting.take_part(&call).unwrap();
-        let cancelled = task.propose("10", PATIENCE).await;
+        let cancelled = task.propose("10", TIMEOUT).await;
         assert!(matches!(cancelled, Err(DialogueError::Cancelled(_))));
         let nothing = task.confirm_cancel().await.unwrap();
         task.reply(nothing).await.unwrap();
@@ -232,13 +232,13 @@ async fn a_contract_net_is_cancelled_with_all_open_participants() {
     };
     let initiator = async {
         // Long enough for the two that answer; the third never does.
-        let patience = Duration::from_secs(3);
+        let timeout = Duration::from_secs(3);
         let net = rover
-            .contract_net(cfp(&rover, "carry"), &ids(&arms), patience)
+            .contract_net(cfp(&rover, "carry"), &ids(&arms), timeout)
             .await
             .unwrap();
         assert_eq!(net.bids().silent, ["thinking"]);
-        net.cancel(PATIENCE).await.unwrap();
+        net.cancel(TIMEOUT).await.unwrap();
     };
     tokio::join!(initiator, waits, thinks, refuses);
     let message = refusing.try_receive().unwrap();
@@ -256,16 +256,16 @@ async fn bidder(
     assert_eq!(text(opening.message()), "a crate");
     let mut task = agent.take_part(&opening).unwrap();
     let (mut calls, mut bought) = (0, 0);
-    while let Some(call) = task.next_call(PATIENCE).await.unwrap() {
+    while let Some(call) = task.next_call(TIMEOUT).await.unwrap() {
         calls += 1;
         let price = text(&call).parse().unwrap();
         if accepts(price) && task.state() != "called-leading" && bought < buys {
-            bought += usize::from(task.propose("", PATIENCE).await.unwrap());
+            bought += usize::from(task.propose("", TIMEOUT).await.unwrap());
         }
     }
     let mut asked = None;
     if task.state() == "won" {
-        asked = Some(text(&task.next(PATIENCE).await.unwrap()).to_owned());
+        asked = Some(text(&task.next(TIMEOUT).await.unwrap()).to_owned());
     }
     (calls, bought, asked)
 }
@@ -280,7 +280,7 @@ async fn the_last_bidder_wins_an_english_auction() {
         let mut auction = rover.english_auction(opening, &bidders).await.unwrap();
         assert_eq!(auction.bidders(), ids(&arms));
         // Both bid, and one bid is accepted. The next call rejects the other one.
-        let bids = auction.call("10", PATIENCE).await.unwrap();
+        let bids = auction.call("10", TIMEOUT).await.unwrap();
         assert_eq!(bids.proposals.len(), 2);
         auction
             .accept(from(&bids.proposals, "poor"), "yours")
@@ -380,7 +380,7 @@ async fn a_bid_that_crosses_the_next_call_does_not_count() {
         let bids = auction.call("10", moment).await.unwrap();
         assert_eq!(bids.silent, ["arm"]);
         first_over.send(()).unwrap();
-        let bids = auction.call("20", PATIENCE).await.unwrap();
+        let bids = auction.call("20", TIMEOUT).await.unwrap();
         assert_eq!(bids.proposals.len(), 1);
         assert_eq!(text(&bids.proposals[0]), "for 20");
         assert!(bids.violations.is_empty());
@@ -391,15 +391,15 @@ async fn a_bid_that_crosses_the_next_call_does_not_count() {
     let participant = async {
         let opening = next_message(arm).await.unwrap();
         let mut task = arm.take_part(&opening).unwrap();
-        task.next_call(PATIENCE).await.unwrap().unwrap();
+        task.next_call(TIMEOUT).await.unwrap().unwrap();
         // The time of the first call is over when this bid is sent.
         ended.await.unwrap();
-        assert!(!task.propose("for 10", PATIENCE).await.unwrap());
-        let second = task.next_call(PATIENCE).await.unwrap().unwrap();
+        assert!(!task.propose("for 10", TIMEOUT).await.unwrap());
+        let second = task.next_call(TIMEOUT).await.unwrap().unwrap();
         assert_eq!(text(&second), "20");
-        assert!(task.propose("for 20", PATIENCE).await.unwrap());
-        assert!(task.next_call(PATIENCE).await.unwrap().is_none());
-        assert_eq!(text(&task.next(PATIENCE).await.unwrap()), "take it");
+        assert!(task.propose("for 20", TIMEOUT).await.unwrap());
+        assert!(task.next_call(TIMEOUT).await.unwrap().is_none());
+        assert_eq!(text(&task.next(TIMEOUT).await.unwrap()), "take it");
     };
     tokio::join!(auctioneer, participant);
 }

@@ -4,7 +4,7 @@ use fipa::protocol::{DialogueError, Reply, Task};
 use fipa::{Agent, Domain, Gateway, Kind, Message, Performative};
 use fipa_testbed::until_async;
 
-use super::{PATIENCE, support, to};
+use super::{TIMEOUT, support, to};
 
 /// More conversations than one host has places for.
 const MANY: usize = 1_100;
@@ -64,7 +64,7 @@ async fn a_host_with_many_conversations_leaves_places_for_others(listen: &str) {
     })
     .await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let mut request = rover.request(lift, PATIENCE).await.unwrap();
+    let mut request = rover.request(lift, TIMEOUT).await.unwrap();
     assert!(request.agreed().await.unwrap());
     assert_eq!(server.running(), 1_025);
 }

@@ -33,7 +33,7 @@ const LAST_ANSWER: &[u8] = include_bytes!("data/jade_http/string.4-http-response
 const OK: &str = "HTTP/1.1 200 OK\r\nContent-Length: 0\r\nConnection: Keep-Alive\r\n\r\n";
 
 /// A watchdog for what never comes.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 type Platform = Party<HttpTransport>;
 
@@ -57,7 +57,7 @@ fn party() -> Platform {
 
 fn connect(to: &Platform) -> TcpStream {
     let stream = TcpStream::connect(to.location().authority()).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
     stream
 }
 
@@ -308,7 +308,7 @@ impl Jade {
 
     /// Returns the next request, as JADE reads it.
     fn request(&self) -> (usize, Envelope, Message) {
-        let (connection, bytes) = self.requests.recv_timeout(PATIENCE).unwrap();
+        let (connection, bytes) = self.requests.recv_timeout(TIMEOUT).unwrap();
         let head = position(&bytes, b"\r\n\r\n").unwrap();
         let text = std::str::from_utf8(&bytes[..head]).unwrap();
         let (_, behind) = text.split_once("boundary=\"").unwrap();
@@ -455,7 +455,7 @@ fn a_closed_connection_is_replaced_for_the_next_letter() {
             .unwrap();
         assert_eq!(party.conclusion(number), Conclusion::Handed);
         assert_eq!(jade.request().0, number as usize);
-        jade.closed.recv_timeout(PATIENCE).unwrap();
+        jade.closed.recv_timeout(TIMEOUT).unwrap();
     }
     let closing = Jade::answering(LAST_ANSWER);
     for number in 10..13 {
@@ -887,7 +887,7 @@ mod tls {
                 Conclusion::Handed => number += 1,
                 other => break other,
             }
-            assert!(SystemTime::now() < end + PATIENCE, "letters still pass");
+            assert!(SystemTime::now() < end + TIMEOUT, "letters still pass");
             thread::sleep(Duration::from_millis(20));
         };
         assert!(number > 0 && SystemTime::now() >= end, "{last:?}");

@@ -21,7 +21,7 @@ use fipa_transport_net::{UdtConfig, UdtTransport};
 use tokio::runtime::Runtime;
 
 /// A test that waits this long has failed.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// An endpoint whose tasks run only while the test waits.
 struct Paused {
@@ -62,7 +62,7 @@ fn run_until_concluded(runtime: &Runtime, sink: &Recorder, count: usize) {
     let began = Instant::now();
     runtime.block_on(async {
         while concluded(sink).len() < count {
-            assert!(began.elapsed() < PATIENCE, "{:?}", concluded(sink));
+            assert!(began.elapsed() < TIMEOUT, "{:?}", concluded(sink));
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
     });

@@ -824,10 +824,10 @@ impl Closing {
     }
 
     /// Waits until the endpoint closes, at most this long.
-    fn wait_for(&self, patience: Duration) {
+    fn wait_for(&self, timeout: Duration) {
         let mut began = self.began.lock();
         let is_open = |began: &mut bool| !*began;
-        self.changed.wait_while_for(&mut began, is_open, patience);
+        self.changed.wait_while_for(&mut began, is_open, timeout);
     }
 }
 

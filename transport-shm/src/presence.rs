@@ -409,12 +409,12 @@ pub(crate) fn wait_for_polls<'a>(
     loop {
         let waited = began.elapsed();
         waited_for.retain(|(before, one)| {
-            let patience = match before {
+            let timeout = match before {
                 0 => START_TIMEOUT,
                 _ => POLL_TIMEOUT,
             };
             let has_polled = one.page.words().polls().wrapping_sub(*before) >= 2;
-            !has_polled && waited < patience && !has_ended(one.live.as_ref())
+            !has_polled && waited < timeout && !has_ended(one.live.as_ref())
         });
         if waited_for.is_empty() || stop() {
             return;

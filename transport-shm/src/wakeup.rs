@@ -132,7 +132,7 @@ impl Drop for Announcement<'_> {
 /// settled and the mailbox is empty.
 ///
 /// A peer that is killed between the two steps leaves an announcement that is never settled. Each poll then
-/// visits all slots, until [`PATIENCE`](Self::PATIENCE) of them have found nothing. Then the account writes the
+/// visits all slots, until [`MAX_EMPTY_LOOKS`](Self::MAX_EMPTY_LOOKS) of them have found nothing. Then the account writes the
 /// announcement off. If its peer was only slow, the parcel is found by the look without an announcement that
 /// [`must_look`](Self::must_look) demands at the end of each polling, as long as something is written off.
 #[derive(Debug, Default)]
@@ -148,7 +148,7 @@ pub(crate) struct Account {
 
 impl Account {
     /// Number of looks into an empty mailbox after which announcements that are not settled are written off.
-    pub(crate) const PATIENCE: u32 = if cfg!(test) { 3 } else { 4096 };
+    pub(crate) const MAX_EMPTY_LOOKS: u32 = if cfg!(test) { 3 } else { 4096 };
 
     /// Whether the mailbox may have a parcel that was announced.
     pub(crate) fn is_open(&self, words: &StatusWords) -> bool {
@@ -205,7 +205,7 @@ impl Account {
             false => 1,
         };
         self.waited = (announced, settled, times);
-        (times >= Self::PATIENCE).then_some((announced, open))
+        (times >= Self::MAX_EMPTY_LOOKS).then_some((announced, open))
     }
 }
 

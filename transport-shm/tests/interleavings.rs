@@ -309,7 +309,7 @@ fn a_busy_process_finds_the_parcel_of_a_slow_peer() {
         let process = Process::new();
         let slow = start_peer(&process, 0, 1);
         let inbox = Combiner::new(Inbox::new());
-        for _ in 0..Account::PATIENCE {
+        for _ in 0..Account::MAX_EMPTY_LOOKS {
             inbox.lock().drain(&process, false);
         }
         // Its peer sees that the process polls, and does not ring.
@@ -375,7 +375,7 @@ fn an_announcement_that_was_written_off_hides_no_parcel() {
         let killed = process.words.announce();
         std::mem::forget(killed);
         let mut inbox = Inbox::new();
-        for _ in 0..Account::PATIENCE {
+        for _ in 0..Account::MAX_EMPTY_LOOKS {
             assert!(inbox.account.is_open(&process.words));
             inbox.drain(&process, false);
         }
@@ -394,7 +394,7 @@ fn a_parcel_of_a_slow_peer_is_found_after_its_announcement_was_written_off() {
         let process = Process::new();
         let peer = start_peer(&process, 0, 1);
         let inbox = Combiner::new(Inbox::new());
-        for _ in 0..Account::PATIENCE {
+        for _ in 0..Account::MAX_EMPTY_LOOKS {
             inbox.lock().drain(&process, false);
         }
         drive(&process, &inbox);

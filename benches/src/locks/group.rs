@@ -17,7 +17,7 @@ const RESOURCE: &str = "bay";
 const COUNTED: usize = 5;
 
 /// Maximum time until all agents take part.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Index of the agent that takes turns with that of index 0. It is on the second host, if there are two.
 const OTHER: usize = 3;
@@ -257,7 +257,7 @@ impl Group {
     async fn count_letters(&mut self) -> Result<[f64; 2], String> {
         let watchers = self.watch().await?;
         let needed = self.shape.variant.letters(self.shape.agents) as u64;
-        let until = Instant::now() + PATIENCE;
+        let until = Instant::now() + TIMEOUT;
         // Agents that have just appeared take part after their first answer, and the watcher counts all
         // letters as soon as all processes have connected.
         for by in [By::Locks, By::Hand] {

@@ -7,7 +7,7 @@ use std::time::Duration;
 use fastrand::Rng;
 use quinn::{ClientConfig, Endpoint, VarInt};
 use tokio::net::UdpSocket;
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
 
 use super::{Script, Writer, mutate};
 
@@ -15,7 +15,7 @@ use super::{Script, Writer, mutate};
 const LARGEST: usize = 65_536;
 
 /// Timeout for an answer, for opening a stream and for a write.
-const PATIENCE: Duration = Duration::from_millis(500);
+const TIMEOUT: Duration = Duration::from_millis(500);
 
 async fn socket(to: SocketAddr) -> UdpSocket {
     let socket = UdpSocket::bind((to.ip(), 0)).await.unwrap();
@@ -64,7 +64,7 @@ pub(crate) async fn udp(to: SocketAddr, writer: &mut Writer<'_>) -> Option<u64> 
     let body = writer.hello();
     let mut answer = [0; 2048];
     socket.send(&hello(number, &[0; 16], &body)).await.ok()?;
-    let len = timeout(PATIENCE, socket.recv(&mut answer))
+    let len = tokio::time::timeout(TIMEOUT, socket.recv(&mut answer))
         .await
         .ok()?
         .ok()?;
@@ -76,7 +76,7 @@ pub(crate) async fn udp(to: SocketAddr, writer: &mut Writer<'_>) -> Option<u64> 
     for packet in &again {
         socket.send(packet).await.ok()?;
     }
-    let len = timeout(PATIENCE, socket.recv(&mut answer))
+    let len = tokio::time::timeout(TIMEOUT, socket.recv(&mut answer))
         .await
         .ok()?
         .ok()?;
@@ -157,7 +157,7 @@ pub(crate) async fn udt(to: SocketAddr, writer: &mut Writer<'_>) -> Option<u64> 
         for packet in &request {
             socket.send(packet).await.ok()?;
         }
-        let answered = timeout(PATIENCE, socket.recv(&mut answer)).await;
+        let answered = tokio::time::timeout(TIMEOUT, socket.recv(&mut answer)).await;
         let len = answered.ok()?.ok()?;
         let word = answer[..len].get(field)?;
         Some(u32::from_be_bytes(word.try_into().ok()?))
@@ -229,7 +229,7 @@ pub(crate) async fn quic(
     let at = relay.as_ref().map_or(to, |relay| relay.at);
     let endpoint = Endpoint::client((to.ip(), 0).into()).unwrap();
     let connecting = endpoint.connect_with(config, at, "x").unwrap();
-    let connection = timeout(Duration::from_secs(3), connecting)
+    let connection = tokio::time::timeout(Duration::from_secs(3), connecting)
         .await
         .ok()?
         .ok()?;
@@ -239,13 +239,13 @@ pub(crate) async fn quic(
         let to_control = number == 0 || random.u8(..4) == 0;
         let mut letter = match to_control {
             true => None,
-            false => match timeout(PATIENCE, connection.open_uni()).await {
+            false => match tokio::time::timeout(TIMEOUT, connection.open_uni()).await {
                 Ok(Ok(stream)) => Some(stream),
                 _ => break,
             },
         };
         let stream = letter.as_mut().unwrap_or(&mut control);
-        match timeout(PATIENCE, stream.write_all(&piece)).await {
+        match tokio::time::timeout(TIMEOUT, stream.write_all(&piece)).await {
             Ok(Ok(())) => written += piece.len() as u64,
             _ => break,
         }
@@ -258,10 +258,10 @@ pub(crate) async fn quic(
         }
         sleep(pause).await;
     }
-    sleep(script.patience).await;
+    sleep(script.timeout).await;
     if random.bool() {
         connection.close(VarInt::from_u32(random.u32(..100)), b"enough");
-        let _ = timeout(PATIENCE, endpoint.wait_idle()).await;
+        let _ = tokio::time::timeout(TIMEOUT, endpoint.wait_idle()).await;
     }
     Some(written)
 }

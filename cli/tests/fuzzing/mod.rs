@@ -58,11 +58,11 @@ const ANSWER: u8 = 3;
 pub(crate) enum Ending {
     /// Closes the connection at once.
     Drop,
-    /// Shuts down the write side, then reads for at most `patience`.
+    /// Shuts down the write side, then reads for at most `timeout`.
     Finish,
-    /// Keeps the connection open and reads for at most `patience`.
+    /// Keeps the connection open and reads for at most `timeout`.
     Linger,
-    /// Keeps the connection open for `patience` without reading.
+    /// Keeps the connection open for `timeout` without reading.
     Deaf,
 }
 
@@ -72,7 +72,7 @@ pub(crate) struct Script {
     /// The pieces to write, each with the pause after it.
     pub(crate) pieces: Vec<(Vec<u8>, Duration)>,
     pub(crate) ending: Ending,
-    pub(crate) patience: Duration,
+    pub(crate) timeout: Duration,
 }
 
 /// Generates conversations.
@@ -179,7 +179,7 @@ impl Writer<'_> {
                 5..7 => Ending::Linger,
                 _ => Ending::Deaf,
             },
-            patience: Duration::from_millis(self.random.u64(..40)),
+            timeout: Duration::from_millis(self.random.u64(..40)),
         }
     }
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 use rustls::pki_types::ServerName;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tokio::net::TcpStream;
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
 use tokio_rustls::TlsConnector;
 
 use super::{Ending, Script};
@@ -48,7 +48,7 @@ async fn perform(stream: impl AsyncRead + AsyncWrite + Unpin, script: Script) ->
     let mut written = 0;
     for (piece, pause) in script.pieces {
         // The gateway may close the connection or stop reading.
-        match timeout(Duration::from_secs(1), write.write_all(&piece)).await {
+        match tokio::time::timeout(Duration::from_secs(1), write.write_all(&piece)).await {
             Ok(Ok(())) => written += piece.len() as u64,
             _ => return written,
         }
@@ -60,14 +60,14 @@ async fn perform(stream: impl AsyncRead + AsyncWrite + Unpin, script: Script) ->
     let _ = write.flush().await;
     match script.ending {
         Ending::Drop => {}
-        Ending::Deaf => sleep(script.patience).await,
+        Ending::Deaf => sleep(script.timeout).await,
         Ending::Finish | Ending::Linger => {
             if script.ending == Ending::Finish {
                 let _ = write.shutdown().await;
             }
             let mut sink = [0; 4096];
             let reading = async { while matches!(read.read(&mut sink).await, Ok(1..)) {} };
-            let _ = timeout(script.patience, reading).await;
+            let _ = tokio::time::timeout(script.timeout, reading).await;
         }
     }
     written

@@ -137,14 +137,14 @@ pub enum HoldDecision {
 }
 
 /// Decides about a letter that came back as out of order. `missing_for` is the time since its
-/// predecessor left the lane or, if it was never in it, since the letter arrived; `patience` is the
+/// predecessor left the lane or, if it was never in it, since the letter arrived; `timeout` is the
 /// maximum time for a predecessor to arrive.
 #[must_use]
-pub fn hold(predecessor_is_here: bool, missing_for: Duration, patience: Duration) -> HoldDecision {
+pub fn hold(predecessor_is_here: bool, missing_for: Duration, timeout: Duration) -> HoldDecision {
     if predecessor_is_here {
         HoldDecision::ForPredecessor
-    } else if missing_for < patience {
-        HoldDecision::For(patience - missing_for)
+    } else if missing_for < timeout {
+        HoldDecision::For(timeout - missing_for)
     } else {
         HoldDecision::Return
     }

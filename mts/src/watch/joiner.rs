@@ -19,7 +19,7 @@ use super::record::{LetterId, Origin, Record, RecordBody, RecordError, Seen, See
 /// Minimum time for which a letter is held back: records of earlier letters may still arrive.
 const HOLD: Duration = Duration::from_millis(40);
 /// Time for which a letter is held back for its outcome.
-const PATIENCE: Duration = Duration::from_millis(250);
+const TIMEOUT: Duration = Duration::from_millis(250);
 /// Maximum number of letters that are held back; beyond it the earliest is reported as it is.
 const MAX_WAITING: usize = 65_536;
 /// Maximum number of reported letters that are remembered, so that none is reported twice.
@@ -427,7 +427,7 @@ impl KnownLetter {
             Fate::Taken | Fate::Passed(_) => passage.from_elsewhere || passage.from_service,
             Fate::Settled(_) => true,
         };
-        self.since + if complete { HOLD } else { PATIENCE }
+        self.since + if complete { HOLD } else { TIMEOUT }
     }
 }
 

@@ -11,8 +11,8 @@ use crate::state::{
     What,
 };
 
-/// Patience of a custodian. The model has no clock, so the patience may end at any time.
-const PATIENCE: Duration = Duration::from_millis(50);
+/// Timeout of a custodian. The model has no clock, so the timeout may end at any time.
+const TIMEOUT: Duration = Duration::from_millis(50);
 
 impl Protocol {
     pub(crate) fn held(state: &mut State, custodian: usize, key: Key) -> Option<&mut Held> {
@@ -230,14 +230,14 @@ impl Protocol {
         }
     }
 
-    /// Decides about a letter that is blocked, when the patience has ended.
+    /// Decides about a letter that is blocked, when the timeout has ended.
     pub(crate) fn hold(&self, state: &mut State, custodian: usize, key: Key) {
         let Some(held) = Self::held(state, custodian, key) else {
             return;
         };
         let after = held.after;
         let here = Self::holds(state, custodian, key.registration, after);
-        match rules::hold(here, PATIENCE, PATIENCE) {
+        match rules::hold(here, TIMEOUT, TIMEOUT) {
             HoldDecision::ForPredecessor | HoldDecision::For(_) => {}
             HoldDecision::Return if self.is(Mutant::NeverReturn) => {}
             HoldDecision::Return => {

@@ -151,8 +151,8 @@ pub(crate) enum Action {
     GiveUp { at: Service, key: Key },
     /// The service notices that the custodian it handed the letter to has died.
     NoticeDeath { at: Service, key: Key },
-    /// The predecessor of a letter has not arrived within the patience of the custodian.
-    LosePatience { custodian: usize, key: Key },
+    /// The predecessor of a letter has not arrived within the timeout of the custodian.
+    LoseTimeout { custodian: usize, key: Key },
     /// The letter's deadline ends at the sender's process.
     Expire { sequence: u8 },
     /// The letter's deadline ends at a custodian.
@@ -385,7 +385,7 @@ impl Model for Protocol {
                 if held.place == Place::Blocked
                     && !Self::holds(state, custodian, key.registration, held.after)
                 {
-                    actions.push(Action::LosePatience { custodian, key });
+                    actions.push(Action::LoseTimeout { custodian, key });
                 }
                 self.out_actions(state, at, key, held.place, actions);
                 if self.allows(state, Fault::EarlyExpiry) {
@@ -518,7 +518,7 @@ impl Model for Protocol {
             Action::NoticeDeath { at, key } => {
                 self.give_up(state, at, key, AttemptEnd::CustodianLost);
             }
-            Action::LosePatience { custodian, key } => self.hold(state, custodian, key),
+            Action::LoseTimeout { custodian, key } => self.hold(state, custodian, key),
             Action::Expire { sequence } => {
                 let letter = &mut state.letters[usize::from(sequence) - 1];
                 letter.uncertain |= matches!(letter.place, Place::Out { .. });

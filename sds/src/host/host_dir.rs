@@ -92,7 +92,7 @@ pub(super) struct HostDir {
 /// Timeout for the lock of the domain while nothing changes in the directory. A process holds the
 /// lock for milliseconds unless it was stopped or waits for the disk: a file system that frees much
 /// space at once, or a worn SD card, can delay a rename for more than ten seconds.
-const PATIENCE: Duration = Duration::from_secs(30);
+const TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Timeout for the lock while other processes take turns: on a busy robot many processes may start
 /// at the same time.
@@ -360,7 +360,7 @@ impl HostDir {
             let now = Some((self.generation()?, self.changed()?));
             if seen != now {
                 (seen, moved) = (now, Instant::now());
-            } else if waited > PATIENCE {
+            } else if waited > TIMEOUT {
                 return Err(busy());
             }
             if began.elapsed() > LONGEST {

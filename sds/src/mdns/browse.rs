@@ -57,7 +57,7 @@ const MISSING: &[Duration] = &[
 const INTRODUCED: Duration = Duration::from_secs(15);
 /// Delays of the queries for a record in doubt, and the time it has to be confirmed.
 const DOUBTED: &[Duration] = &[Duration::ZERO, Duration::from_millis(1100)];
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 /// Time for which a record stays known after its goodbye, so that the goodbye can be revoked (RFC
 /// 6762 clause 10.1).
 const GOODBYE: Duration = Duration::from_secs(1);
@@ -472,7 +472,7 @@ impl Browser {
                 continue;
             };
             if known.known {
-                known.ends_at(now + PATIENCE);
+                known.ends_at(now + TIMEOUT);
                 known.questions = Some(Questions::new(now, DOUBTED));
                 self.wake(now);
             }

@@ -6,7 +6,7 @@
 //! change. Received coalition records of a gateway wait here until they match its beacon, and then
 //! become visible as one update.
 //!
-//! The wait is bounded: records that do not match after [`PATIENCE`] become visible as they are,
+//! The wait is bounded: records that do not match after [`TIMEOUT`] become visible as they are,
 //! and so do those of a gateway whose beacons have stopped. A host that forges beacons can
 //! therefore only delay coalition changes by that time. Agents never wait.
 
@@ -22,7 +22,7 @@ use crate::{Entry, Role};
 
 /// Maximum time for which a record waits: a changed record stays unchanged for three seconds, a new
 /// one is probed for most of a second, and a lost beacon is repeated after two and a half.
-const PATIENCE: Duration = Duration::from_secs(7);
+const TIMEOUT: Duration = Duration::from_secs(7);
 /// Maximum number of waiting records of all gateways.
 const MAX_WAITING: usize = 1024;
 /// Maximum number of gateways with waiting coalitions.
@@ -198,9 +198,9 @@ impl Gateway {
 
     /// Time at which its waiting records become visible in any case.
     fn due(&self) -> Option<Instant> {
-        let patience = self.since? + PATIENCE;
+        let timeout = self.since? + TIMEOUT;
         let silent = self.beacon.map(|(when, _)| when + SILENCE);
-        Some(silent.map_or(patience, |silent| silent.min(patience)))
+        Some(silent.map_or(timeout, |silent| silent.min(timeout)))
     }
 }
 
@@ -311,9 +311,9 @@ mod tests {
         let gateway = Incarnation::from_u64(1);
         sync.handle_beacon(now, gateway, digest(1, &half));
         assert!(put(&mut sync, now, &half, "one").is_empty());
-        assert_eq!(sync.poll_timeout(), Some(now + PATIENCE));
-        assert!(sync.handle_timeout(now + PATIENCE / 2).is_empty());
-        assert_eq!(sync.handle_timeout(now + PATIENCE).len(), 1);
+        assert_eq!(sync.poll_timeout(), Some(now + TIMEOUT));
+        assert!(sync.handle_timeout(now + TIMEOUT / 2).is_empty());
+        assert_eq!(sync.handle_timeout(now + TIMEOUT).len(), 1);
         assert_eq!(sync.poll_timeout(), None);
         // A gateway without beacons is not waited for.
         let later = now + SILENCE;
@@ -338,7 +338,7 @@ mod tests {
         assert!(sync.put(now, &name, Some(other)).is_empty());
         assert_eq!(sync.put(now, &name, Some(Arc::new(agent))).len(), 1);
         assert_eq!(sync.waiting, 0);
-        assert!(sync.handle_timeout(now + PATIENCE).is_empty());
+        assert!(sync.handle_timeout(now + TIMEOUT).is_empty());
     }
 
     #[test]
@@ -352,7 +352,7 @@ mod tests {
             assert!(sync.waiting <= MAX_WAITING);
         }
         assert!(sync.gateways.len() <= MAX_GATEWAYS);
-        visible += sync.handle_timeout(now + PATIENCE).len();
+        visible += sync.handle_timeout(now + TIMEOUT).len();
         assert_eq!((visible, sync.waiting), (10_000, 0));
     }
 

@@ -28,7 +28,7 @@ const ASKED: [Duration; 3] = [
     Duration::from_millis(1300),
 ];
 /// Total time to wait for answers. Gateways send a beacon every 2 to 2.5 s.
-const PATIENCE: Duration = Duration::from_millis(2700);
+const TIMEOUT: Duration = Duration::from_millis(2700);
 /// Interval between polls of the sockets.
 const TICK: Duration = Duration::from_millis(5);
 /// Maximum number of hosts remembered per interface.
@@ -75,7 +75,7 @@ pub fn probe(config: &MdnsConfig) -> io::Result<Vec<Multicast>> {
     let question = question().map_err(io::Error::other)?;
     let mut buffer = vec![0; MAX_PACKET];
     let (started, mut asked) = (Instant::now(), 0);
-    while started.elapsed() < PATIENCE && !probes.is_empty() {
+    while started.elapsed() < TIMEOUT && !probes.is_empty() {
         if ASKED
             .get(asked)
             .is_some_and(|due| started.elapsed() >= *due)

@@ -16,7 +16,7 @@ use crate::end::ConnectionEnd;
 const STAGGER: Duration = Duration::from_millis(250);
 
 /// First and longest pause before a hello is repeated.
-const PATIENCE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_millis(500));
+const TIMEOUT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_millis(500));
 
 /// The hello of a protocol.
 pub(crate) trait Greeting {
@@ -118,12 +118,12 @@ impl<G: Greeting> Dialing<G> {
     pub(crate) fn handle_timeout(
         &mut self,
         now: Instant,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<(), ConnectionEnd> {
         if now < self.deadline {
             return Ok(());
         }
-        let detail = format!("no answer within {patience:?} (connect_timeout)");
+        let detail = format!("no answer within {timeout:?} (connect_timeout)");
         Err(ConnectionEnd::NotOpened(TransportError::new(
             TransportErrorKind::Unreachable,
             detail,
@@ -135,8 +135,8 @@ impl<G: Greeting> Dialing<G> {
             .candidates
             .iter_mut()
             .find(|c| c.next.is_some_and(|next| next <= now))?;
-        let wait = PATIENCE.0.saturating_mul(1 << candidate.tries.min(8));
-        candidate.next = Some(now + wait.min(PATIENCE.1));
+        let wait = TIMEOUT.0.saturating_mul(1 << candidate.tries.min(8));
+        candidate.next = Some(now + wait.min(TIMEOUT.1));
         candidate.tries += 1;
         // A round trip is only measured when a single hello was sent, because an answer does not
         // name its hello.

@@ -126,14 +126,12 @@ impl HttpSender {
             true => vec![[&head[..], &message, end.as_bytes()].concat().into()],
             false => vec![Bytes::from(head), message, Bytes::from(end)],
         };
-        let patience = endpoint.stream.limits().stall_timeout;
+        let timeout = endpoint.stream.limits().stall_timeout;
         for piece in pieces {
-            let written = progress
-                .write(&mut connection.stream, piece, patience)
-                .await;
+            let written = progress.write(&mut connection.stream, piece, timeout).await;
             written.map_err(|error| progress.broken(error))?;
         }
-        let answer = connection.answer(patience).await;
+        let answer = connection.answer(timeout).await;
         let answer = answer.map_err(Conclusion::Unconfirmed)?;
         connection.used = Instant::now();
         self.connection = answer.keeps.then_some(connection);
@@ -195,8 +193,8 @@ impl HttpSender {
         let endpoint = &self.endpoint.stream;
         #[cfg(feature = "secure")]
         if let Some(security) = &self.endpoint.tls {
-            let patience = endpoint.limits().handshake_timeout;
-            let secured = super::tls::connect(security, stream, _url, patience).await;
+            let timeout = endpoint.limits().handshake_timeout;
+            let secured = super::tls::connect(security, stream, _url, timeout).await;
             let stream = secured.map_err(|HandshakeError { fault, what }| {
                 count(&endpoint.tally().dial_failures);
                 TransportError::new(fault, format_args!("{peer}: {what}"))
@@ -230,8 +228,8 @@ impl LegacySender for HttpSender {
 
 impl Connection {
     /// Reads the answer to a request.
-    async fn answer(&mut self, patience: Duration) -> Result<Response, TransportError> {
-        let until = Instant::now() + patience;
+    async fn answer(&mut self, timeout: Duration) -> Result<Response, TransportError> {
+        let until = Instant::now() + timeout;
         loop {
             let answer = self.reader.next();
             let incompatible = |error| TransportError::new(TransportErrorKind::Incompatible, error);

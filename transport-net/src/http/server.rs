@@ -16,7 +16,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
-use tokio::time::{Instant, sleep_until, timeout, timeout_at};
+use tokio::time::{Instant, sleep_until, timeout_at};
 
 use super::HttpEndpoint;
 use super::connections::Slot;
@@ -208,7 +208,7 @@ impl Serving {
         let from = self.from;
         log_limit::warn!(of: quota_address(from.ip()), "{from}: HTTP request refused: {refusal}");
         let refused = self.refuse(refusal.status());
-        if let Ok(Err(error)) = timeout(LAST_ANSWER, refused).await {
+        if let Ok(Err(error)) = tokio::time::timeout(LAST_ANSWER, refused).await {
             tracing::debug!(%from, "cannot answer a refused request: {error}");
         }
     }
@@ -218,11 +218,11 @@ impl Serving {
     async fn secured(mut self) -> Option<Self> {
         let endpoint = Arc::clone(&self.endpoint);
         let security = endpoint.tls.as_ref()?;
-        let patience = self.limits().handshake_timeout;
+        let timeout = self.limits().handshake_timeout;
         let Socket::Plain(stream) = self.stream else {
             return None;
         };
-        match super::tls::accept(security, stream, patience).await {
+        match super::tls::accept(security, stream, timeout).await {
             Ok((stream, proof)) => {
                 self.stream = Socket::Tls(Box::new(stream));
                 self.proof = proof;
@@ -271,15 +271,15 @@ impl Serving {
         }
         loop {
             self.first_byte().await?;
-            let patience = self.limits().handshake_timeout;
-            let head = timeout(patience, self.head()).await;
+            let timeout = self.limits().handshake_timeout;
+            let head = tokio::time::timeout(timeout, self.head()).await;
             let head = head.map_err(|_| Refusal::SlowHead)??;
             let (body, room) = self.body(&head).await?;
             self.take(&head, body).await?;
             drop(room);
             let answer = Status::Ok.answer(head.keeps);
-            let patience = self.limits().stall_timeout;
-            match timeout(patience, self.stream.write_all(answer.as_bytes())).await {
+            let timeout = self.limits().stall_timeout;
+            match tokio::time::timeout(timeout, self.stream.write_all(answer.as_bytes())).await {
                 Ok(written) => written?,
                 Err(_) => return Err(End::Over),
             }
@@ -298,11 +298,11 @@ impl Serving {
     /// Waits for the first byte of a request.
     async fn first_byte(&mut self) -> Result<(), End> {
         let limits = self.limits();
-        let patience = match self.first {
+        let timeout = match self.first {
             true => limits.handshake_timeout,
             false => limits.idle_close,
         };
-        let until = Instant::now() + patience;
+        let until = Instant::now() + timeout;
         while self.reader.is_idle()? {
             match timeout_at(until, self.read(READ)).await {
                 Ok(read) => read?,
@@ -345,10 +345,10 @@ impl Serving {
                 .write_all(b"HTTP/1.1 100 Continue\r\n\r\n")
                 .await?;
         }
-        let patience = self.limits().stall_timeout;
+        let timeout = self.limits().stall_timeout;
         let mut missing = self.reader.missing(head.length);
         self.reader.buffer().reserve(missing);
-        let mut window = (Instant::now() + patience, missing);
+        let mut window = (Instant::now() + timeout, missing);
         while missing > 0 {
             match timeout_at(window.0, self.read(missing)).await {
                 Ok(read) => read?,
@@ -358,7 +358,7 @@ impl Serving {
                     if progress < least.max(Limits::MIN_PROGRESS) {
                         return Err(Refusal::SlowBody.into());
                     }
-                    window = (Instant::now() + patience, missing);
+                    window = (Instant::now() + timeout, missing);
                 }
             }
             missing = self.reader.missing(head.length);

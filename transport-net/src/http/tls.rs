@@ -11,7 +11,7 @@ use fipa_transport::TransportErrorKind;
 use rustls::CertificateError;
 use rustls::pki_types::ServerName;
 use tokio::net::TcpStream;
-use tokio::time::timeout;
+use tokio::time;
 use tokio_rustls::{TlsAcceptor, TlsConnector, TlsStream};
 
 use super::guarded::Guarded;
@@ -27,13 +27,13 @@ pub(super) type Stream = Guarded<TlsStream<TcpStream>>;
 pub(super) async fn accept(
     security: &Security,
     stream: TcpStream,
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<(Stream, Proof), String> {
     let config = security
         .platform_server()
         .map_err(|error| error.to_string())?;
-    let handshake = timeout(patience, TlsAcceptor::from(config).accept(stream)).await;
-    let handshake = handshake.map_err(|_| overdue(patience))?;
+    let handshake = time::timeout(timeout, TlsAcceptor::from(config).accept(stream)).await;
+    let handshake = handshake.map_err(|_| overdue(timeout))?;
     let stream = handshake.map_err(|error| error.to_string())?;
     let trust = security.trust_in_client(stream.get_ref().1.peer_certificates());
     let proof = trust.map(Proof::from).unwrap_or_default();
@@ -51,7 +51,7 @@ pub(super) async fn connect(
     security: &Security,
     stream: TcpStream,
     url: &Url,
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<Stream, HandshakeError> {
     let refused = |what: String| HandshakeError {
         fault: TransportErrorKind::Refused,
@@ -65,8 +65,8 @@ pub(super) async fn connect(
     let config = config.map_err(|error| refused(error.to_string()))?;
     let name = server_name(url).map_err(distrusted)?;
     let connector = TlsConnector::from(config);
-    let handshake = timeout(patience, connector.connect(name.clone(), stream)).await;
-    let handshake = handshake.map_err(|_| refused(overdue(patience)))?;
+    let handshake = time::timeout(timeout, connector.connect(name.clone(), stream)).await;
+    let handshake = handshake.map_err(|_| refused(overdue(timeout)))?;
     let stream = handshake.map_err(|error| match of_tls(&error) {
         Some(rustls::Error::InvalidCertificate(_)) => distrusted(advice(&error)),
         _ => refused(advice(&error)),
@@ -87,8 +87,8 @@ fn server_name(url: &Url) -> Result<ServerName<'static>, String> {
     }
 }
 
-fn overdue(patience: Duration) -> String {
-    format!("TLS handshake not complete within {patience:?} (handshake_timeout)")
+fn overdue(timeout: Duration) -> String {
+    format!("TLS handshake not complete within {timeout:?} (handshake_timeout)")
 }
 
 fn of_tls(error: &std::io::Error) -> Option<&rustls::Error> {

@@ -17,7 +17,7 @@ use parking_lot::Mutex;
 use tokio::io::{AsyncWrite, AsyncWriteExt};
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
-use tokio::time::timeout;
+use tokio::time;
 
 use crate::end::{self, ConnectionEnd};
 use crate::stream::config::Limits;
@@ -96,17 +96,17 @@ impl Progress<'_> {
         Ok(())
     }
 
-    /// Writes a piece of the letter. The peer must read each step within `patience`.
+    /// Writes a piece of the letter. The peer must read each step within `timeout`.
     pub(crate) async fn write(
         &self,
         stream: &mut (impl AsyncWrite + Unpin),
         mut piece: Bytes,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<(), TransportError> {
         while !piece.is_empty() {
             let mut step = piece.split_to(piece.len().min(STEP));
             *self.written.lock() = true;
-            match timeout(patience, stream.write_all_buf(&mut step)).await {
+            match time::timeout(timeout, stream.write_all_buf(&mut step)).await {
                 Ok(Ok(())) => {}
                 Ok(Err(error)) => return Err(end::of_io(error)),
                 Err(_) => {

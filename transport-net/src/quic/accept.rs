@@ -6,7 +6,7 @@ use std::sync::Arc;
 use bytes::BytesMut;
 use fipa_transport::{log_limit, quota_address};
 use quinn::{Connection, Incoming, RecvStream, SendStream};
-use tokio::time::timeout;
+use tokio::time;
 
 use super::dial::ends;
 use super::sockets::{Sockets, lost};
@@ -49,8 +49,8 @@ async fn receive(
     incoming: Incoming,
 ) {
     let from = incoming.remote_address();
-    let patience = endpoint.limits().handshake_timeout;
-    let handshake_result = match timeout(patience, handshake(&sockets, incoming)).await {
+    let timeout = endpoint.limits().handshake_timeout;
+    let handshake_result = match time::timeout(timeout, handshake(&sockets, incoming)).await {
         Ok(Ok((connection, send, receive))) => match sockets.proof(&connection) {
             Some(proof) => Ok((connection, send, receive, proof)),
             None => Err("the peer's certificate is no longer trusted".to_owned()),
@@ -63,7 +63,7 @@ async fn receive(
             Err(why)
         }
         Err(_) => Err(format!(
-            "handshake not complete within {patience:?} (handshake_timeout)"
+            "handshake not complete within {timeout:?} (handshake_timeout)"
         )),
     };
     let (connection, send, receive, proof) = match handshake_result {

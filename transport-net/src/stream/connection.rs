@@ -410,7 +410,7 @@ impl Connection {
         let begun = self.sent.get(&id).and_then(|sent| sent.begun);
         if let Some(begun) = begun
             && begun > self.clock.received
-            && now >= begun + self.answer_patience()
+            && now >= begun + self.answer_timeout()
             && self.doubt(now, Duration::ZERO)
         {
             self.suspect = true;
@@ -485,7 +485,7 @@ impl Connection {
     /// need another connection, because the system retransmits lost packets with growing pauses.
     fn suspect_slow_start(&mut self, now: Instant) {
         let since = self.clock.connected.unwrap_or(self.clock.received);
-        self.suspect |= now >= since + self.answer_patience();
+        self.suspect |= now >= since + self.answer_timeout();
     }
 
     /// Whether letters should take another connection with the same peer, if there is one or one
@@ -502,7 +502,7 @@ impl Connection {
 
     /// Returns the time without any byte from the peer after which an abandoned attempt makes the
     /// connection suspect.
-    fn answer_patience(&self) -> Duration {
+    fn answer_timeout(&self) -> Duration {
         self.limits.keep_alive / 20 + self.transfer_time()
     }
 
@@ -526,7 +526,7 @@ impl Connection {
     }
 
     /// Returns the time that a peer in doubt has to respond.
-    pub(crate) fn doubt_patience(&self) -> Duration {
+    pub(crate) fn doubt_timeout(&self) -> Duration {
         self.limits.keep_alive / 4
     }
 
@@ -538,7 +538,7 @@ impl Connection {
             true => doubted,
             false => doubted.max(self.clock.written),
         };
-        Some(since + self.doubt_patience() + self.transfer_time())
+        Some(since + self.doubt_timeout() + self.transfer_time())
     }
 
     /// Handles a frame of the peer.

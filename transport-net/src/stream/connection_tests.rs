@@ -459,23 +459,23 @@ fn a_silent_peer_gets_a_ping_and_is_then_given_up() {
 fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
-    let patience = limits().keep_alive / 4;
+    let timeout = limits().keep_alive / 4;
     assert!(
-        !a.connection.doubt(start, patience),
+        !a.connection.doubt(start, timeout),
         "a byte has just arrived"
     );
     // A peer that responds keeps its connection.
-    let mut now = start + patience;
-    assert!(a.connection.doubt(now, patience));
+    let mut now = start + timeout;
+    assert!(a.connection.doubt(now, timeout));
     settle(&mut a, &mut b, now);
-    now += patience;
+    now += timeout;
     a.connection.handle_timeout(now, [0; 2]).unwrap();
     // A peer that does not respond is given up; doubting again grants no more time.
     assert!(a.connection.doubt(now, Duration::ZERO));
     a.transmit(usize::MAX, &mut b.coming, now);
     let due = a.connection.poll_timeout().unwrap();
-    assert_eq!(due, now + patience);
-    now += patience / 2;
+    assert_eq!(due, now + timeout);
+    now += timeout / 2;
     assert!(a.connection.doubt(now, Duration::ZERO));
     a.connection.handle_timeout(now, [0; 2]).unwrap();
     assert_eq!(
@@ -489,16 +489,16 @@ fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
     let start = Instant::now();
     let (mut a, _b) = greeted(start);
     a.dispatch(4000).unwrap();
-    let patience = limits().keep_alive / 4;
+    let timeout = limits().keep_alive / 4;
     assert!(a.connection.doubt(start, Duration::ZERO));
     let mut now = start;
     for _ in 0..10 {
-        now += patience / 2;
+        now += timeout / 2;
         a.transmit(100, &mut BytesMut::new(), now);
         a.connection.handle_timeout(now, [0; 2]).unwrap();
     }
     // The written bytes have time to arrive.
-    now += patience + Duration::from_millis(10);
+    now += timeout + Duration::from_millis(10);
     assert_eq!(
         a.connection.handle_timeout(now, [0; 2]),
         Err(ConnectionEnd::Silent)
@@ -509,7 +509,7 @@ fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
 fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
-    let patience = limits().keep_alive / 20 + Duration::from_millis(50);
+    let timeout = limits().keep_alive / 20 + Duration::from_millis(50);
     let dispatch = |a: &mut Side, now| {
         a.dispatch(10).unwrap();
         a.transmit(usize::MAX, &mut BytesMut::new(), now);
@@ -518,25 +518,24 @@ fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
     let now = start + Duration::from_millis(1);
     let first = dispatch(&mut a, now);
     // A letter with a short deadline does not make the connection suspect.
-    a.connection.abandon(first, now + patience / 2);
+    a.connection.abandon(first, now + timeout / 2);
     assert!(!a.connection.is_suspect());
     let second = dispatch(&mut a, now);
     a.connection
-        .received(Reader::Main, 1, false, now + patience / 2);
-    a.connection.abandon(second, now + patience * 2);
+        .received(Reader::Main, 1, false, now + timeout / 2);
+    a.connection.abandon(second, now + timeout * 2);
     assert!(!a.connection.is_suspect(), "a byte arrived meanwhile");
-    let now = now + patience * 3;
+    let now = now + timeout * 3;
     let third = dispatch(&mut a, now);
-    a.connection.abandon(third, now + patience);
+    a.connection.abandon(third, now + timeout);
     assert!(a.connection.is_suspect());
     // The peer gets a ping, and its response counts.
     let mut asked = BytesMut::new();
-    a.transmit(usize::MAX, &mut asked, now + patience);
+    a.transmit(usize::MAX, &mut asked, now + timeout);
     assert!(!asked.is_empty());
-    a.connection
-        .received(Reader::Main, 1, false, now + patience);
+    a.connection.received(Reader::Main, 1, false, now + timeout);
     assert!(!a.connection.is_suspect());
-    settle(&mut a, &mut b, now + patience);
+    settle(&mut a, &mut b, now + timeout);
 }
 
 #[test]

@@ -9,7 +9,7 @@ use std::time::Duration;
 use fipa_transport::{Kind, Location, Sink, log_limit};
 use parking_lot::Mutex;
 use tokio::task::JoinSet;
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
 
 use super::endpoint::Endpoint;
 use super::link::Link;
@@ -147,22 +147,22 @@ where
             })
         }
     });
-    let patience = endpoint.limits().connect_timeout;
-    match timeout(patience, race(attempts)).await {
+    let timeout = endpoint.limits().connect_timeout;
+    match tokio::time::timeout(timeout, race(attempts)).await {
         Ok(connected) => connected.map_err(|error| Unreachable {
             what: error.to_string(),
             is_silent: error.kind() == io::ErrorKind::TimedOut,
         }),
         Err(_) => Err(Unreachable {
-            what: nothing_answered(&all, protocol, patience),
+            what: nothing_answered(&all, protocol, timeout),
             is_silent: true,
         }),
     }
 }
 
 /// The error when no packet came back, which in most cases means that a firewall drops them.
-fn nothing_answered(addresses: &str, protocol: &str, patience: Duration) -> String {
-    let seconds = patience.as_secs_f32();
+fn nothing_answered(addresses: &str, protocol: &str, timeout: Duration) -> String {
+    let seconds = timeout.as_secs_f32();
     let port = addresses.rsplit(':').next().unwrap_or_default();
     format!(
         "nothing answered on {addresses} for {seconds} s; check that a firewall there lets it in (for \

@@ -21,7 +21,7 @@ use fipa_transport::{
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
-use tokio::time::{sleep_until, timeout};
+use tokio::time::sleep_until;
 
 use super::budget::ContentBuffer;
 use super::connection::{Connection, Event, MAX_ID, Predecessors, Reader, SendError};
@@ -240,7 +240,7 @@ impl Link {
         }
         let peer = state.connection.peer();
         let listed = peer.is_some_and(|peer| peer.listening.iter().any(|it| it == to.address()));
-        let quiet = state.connection.doubt_patience();
+        let quiet = state.connection.doubt_timeout();
         if listed || state.connection.doubt(Instant::now(), quiet) {
             state.leads_to = Some(to.clone());
         }
@@ -275,12 +275,12 @@ impl Link {
         self.flush(&mut state);
     }
 
-    /// Returns whether a byte of the peer arrives within `patience` after the ping at `asked`. After the peer has
+    /// Returns whether a byte of the peer arrives within `timeout` after the ping at `asked`. After the peer has
     /// announced that it is elsewhere, within `after_left`.
     pub(crate) async fn answers(
         &self,
         asked: Instant,
-        patience: Duration,
+        timeout: Duration,
         after_left: Duration,
     ) -> bool {
         loop {
@@ -295,7 +295,7 @@ impl Link {
                 state.left
             };
             let left = left.map(|left| left.max(asked) + after_left);
-            let due = left.map_or(asked + patience, |left| left.min(asked + patience));
+            let due = left.map_or(asked + timeout, |left| left.min(asked + timeout));
             let due = tokio::time::Instant::from_std(due);
             tokio::select! {
                 () = received => {}
@@ -585,7 +585,10 @@ impl LinkTask {
         let end = match (end, &self.peer) {
             (ConnectionEnd::Broken(what), None) => {
                 let reason = self.reason((&mut read, &mut reader), from, &mut greeted);
-                let reason = timeout(REASON_TIMEOUT, reason).await.ok().flatten();
+                let reason = tokio::time::timeout(REASON_TIMEOUT, reason)
+                    .await
+                    .ok()
+                    .flatten();
                 reason.unwrap_or(ConnectionEnd::Broken(what))
             }
             (end, _) => end,
@@ -602,7 +605,7 @@ impl LinkTask {
             writer.discard();
         }
         drop((writer, extra, reader));
-        let (link, patience) = (self.link.clone(), self.endpoint.limits().handshake_timeout);
+        let (link, timeout) = (self.link.clone(), self.endpoint.limits().handshake_timeout);
         let orderly = self.end.is_orderly();
         // A peer of another version has nothing to send that counts.
         let most = match self.end {
@@ -612,7 +615,7 @@ impl LinkTask {
         drop(self);
         if orderly {
             // After the timeout, the socket is closed without waiting for the peer.
-            let _ = timeout(patience, close_gracefully(&link, read, most)).await;
+            let _ = tokio::time::timeout(timeout, close_gracefully(&link, read, most)).await;
         }
         link.state.lock().writer = None;
     }

@@ -14,7 +14,7 @@ use rustls::Connection;
 use rustls::pki_types::ServerName;
 use tokio::net::TcpStream;
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
-use tokio::time::timeout;
+use tokio::time;
 use tokio_rustls::{TlsAcceptor, TlsConnector};
 
 use super::frame::Space;
@@ -48,11 +48,11 @@ pub(crate) struct Secured {
 pub(crate) async fn accept(
     security: &Security,
     stream: TcpStream,
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<Secured, String> {
     let acceptor = TlsAcceptor::from(security.server());
-    let handshake = timeout(patience, acceptor.accept(stream)).await;
-    let handshake = handshake.map_err(|_| handshake_timeout(patience))?;
+    let handshake = time::timeout(timeout, acceptor.accept(stream)).await;
+    let handshake = handshake.map_err(|_| handshake_timeout(timeout))?;
     let (stream, session) = handshake
         .map_err(|error| handshake_error(&error, ACCEPT_CAUSES))?
         .into_inner();
@@ -64,21 +64,21 @@ pub(crate) async fn connect(
     security: &Security,
     stream: TcpStream,
     peer: SocketAddr,
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<Secured, String> {
     let connector = TlsConnector::from(security.client());
     // The name is neither sent nor verified: the certificate identifies the peer.
     let name = ServerName::from(peer.ip());
-    let handshake = timeout(patience, connector.connect(name, stream)).await;
-    let handshake = handshake.map_err(|_| handshake_timeout(patience))?;
+    let handshake = time::timeout(timeout, connector.connect(name, stream)).await;
+    let handshake = handshake.map_err(|_| handshake_timeout(timeout))?;
     let (stream, session) = handshake
         .map_err(|error| handshake_error(&error, CONNECT_CAUSES))?
         .into_inner();
     secured(security, stream, session.into())
 }
 
-fn handshake_timeout(patience: Duration) -> String {
-    format!("TLS handshake not complete within {patience:?} (handshake_timeout)")
+fn handshake_timeout(timeout: Duration) -> String {
+    format!("TLS handshake not complete within {timeout:?} (handshake_timeout)")
 }
 
 /// Whether the peer ended the connection without an alert, as a peer without TLS does.

@@ -10,7 +10,7 @@ use fipa_transport::{LegacySource, log_limit, quota_address};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
-use tokio::time::{sleep, sleep_until, timeout};
+use tokio::time::{sleep, sleep_until};
 
 use super::accept_queue::{self, Full, QueueTurn, TURN};
 use super::endpoint::TcpEndpoint;
@@ -52,7 +52,7 @@ pub(crate) async fn accept(endpoint: Arc<TcpEndpoint>, listener: TcpListener) {
 /// The pace of accepting. Accepting a connection is faster than reading a letter, and the letters
 /// that are not accepted yet are safe in the system's queue. Therefore accepting pauses while many
 /// connections wait and are served. A peer that keeps its connections from being served does not
-/// slow down accepting for longer than [`Pace::PATIENCE`] pauses.
+/// slow down accepting for longer than [`Pace::MAX_PAUSES`] pauses.
 #[derive(Debug, Default)]
 struct Pace {
     /// Number of connections that had left the queues at the last pause.
@@ -68,13 +68,13 @@ impl Pace {
     const BUSY: usize = 64;
 
     /// Maximum number of consecutive pauses in which no connection leaves the queues.
-    const PATIENCE: u32 = 50;
+    const MAX_PAUSES: u32 = 50;
 
     fn pauses(&mut self, waiting: usize, left: u64) -> bool {
         if left != self.left {
             *self = Self { left, fruitless: 0 };
         }
-        let pauses = waiting >= Self::BUSY && self.fruitless < Self::PATIENCE;
+        let pauses = waiting >= Self::BUSY && self.fruitless < Self::MAX_PAUSES;
         if pauses {
             self.fruitless += 1;
         }
@@ -215,16 +215,16 @@ async fn first_byte(
     from: SocketAddr,
     task: &AbortHandle,
 ) -> Option<(Waiting, First)> {
-    let patience = endpoint.limits().handshake_timeout;
-    let turn = TURN.min(patience);
+    let timeout = endpoint.limits().handshake_timeout;
+    let turn = TURN.min(timeout);
     let mut byte = [0];
-    let mut peeked = timeout(turn, stream.peek(&mut byte)).await;
+    let mut peeked = tokio::time::timeout(turn, stream.peek(&mut byte)).await;
     if peeked.is_err() && accept_queue::is_silent(stream) {
         if let Waiting::InTurn(turn) = waiting {
             drop(turn);
             waiting = Waiting::Late(unproved_slot(endpoint, from, task.clone())?);
         }
-        peeked = timeout(patience - turn, stream.peek(&mut byte)).await;
+        peeked = tokio::time::timeout(timeout - turn, stream.peek(&mut byte)).await;
     } else if peeked.is_err() {
         peeked = Ok(stream.peek(&mut byte).await);
     }
@@ -344,11 +344,11 @@ async fn prove(
     let Some(security) = &endpoint.config.security else {
         return Some((waiting, stream));
     };
-    let patience = endpoint.limits().handshake_timeout;
+    let timeout = endpoint.limits().handshake_timeout;
     let refused = match first {
         First::Byte(tls::FIRST_BYTE) => {
             let slot = waiting.introduces_itself(endpoint, from, task.clone())?;
-            match tls::accept(security, Arc::into_inner(stream)?, patience).await {
+            match tls::accept(security, Arc::into_inner(stream)?, timeout).await {
                 Ok(secured) => {
                     let (link, sink) = endpoint.accepted()?;
                     let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
@@ -402,7 +402,7 @@ mod tests {
         }
         // No connection is served any longer.
         let pauses = (0..1000).filter(|_| pace.pauses(500, 999)).count();
-        assert_eq!(pauses as u32, Pace::PATIENCE - 1);
+        assert_eq!(pauses as u32, Pace::MAX_PAUSES - 1);
         assert!(pace.pauses(500, 1000));
     }
 }

@@ -85,8 +85,8 @@ async fn prove(
     let config = &running.endpoint().config;
     match &config.security {
         Some(security) if !config.takes_frames_of(peer.ip()) => {
-            let patience = config.limits.handshake_timeout;
-            let secured = tls::connect(security, stream, peer, patience).await?;
+            let timeout = config.limits.handshake_timeout;
+            let secured = tls::connect(security, stream, peer, timeout).await?;
             Ok((secured.ends, secured.proof))
         }
         _ => Ok((wire::plain(stream), Proof::default())),

@@ -10,7 +10,7 @@ use std::time::Duration;
 use fipa_transport::{Conclusion, Location, Signature, TransportError, TransportErrorKind};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
-use tokio::time::timeout;
+use tokio::time;
 
 use super::endpoint::TcpEndpoint;
 use crate::legacy::dialect::{Here, translate};
@@ -75,8 +75,8 @@ impl TcpSender {
         prepare(&stream, endpoint.limits()).map_err(|error| Conclusion::NotSent(broken(error)))?;
         progress.begin()?;
         for piece in letter {
-            let patience = endpoint.limits().stall_timeout;
-            let written = progress.write(&mut stream, piece, patience).await;
+            let timeout = endpoint.limits().stall_timeout;
+            let written = progress.write(&mut stream, piece, timeout).await;
             written.map_err(|error| progress.broken(error))?;
         }
         let finished = finish(&mut stream).await;
@@ -94,7 +94,7 @@ async fn finish(stream: &mut TcpStream) -> std::io::Result<()> {
         while stream.read(&mut ignored).await? > 0 {}
         Ok(())
     };
-    timeout(CLOSE_TIMEOUT, hangup).await.unwrap_or(Ok(()))
+    time::timeout(CLOSE_TIMEOUT, hangup).await.unwrap_or(Ok(()))
 }
 
 /// Returns the listening address with the IP address `local` as a URL, if the endpoint listens

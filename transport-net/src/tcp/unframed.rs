@@ -90,9 +90,9 @@ async fn read_to_end(
                 // A letter with a reservation never waits for a later one, so letters do not wait
                 // for each other in a cycle.
                 turn.is_first().await;
-                let patience = limits.stall_timeout.saturating_mul(2);
+                let timeout = limits.stall_timeout.saturating_mul(2);
                 let taken = take_room(endpoint, quota_key, &mut room, bytes.len(), more);
-                let in_time = timeout_at(Instant::now() + patience, taken).await;
+                let in_time = timeout_at(Instant::now() + timeout, taken).await;
                 in_time.map_err(|_| UnframedError::NoRoom)?;
                 window = (Instant::now() + limits.stall_timeout, bytes.len());
             }

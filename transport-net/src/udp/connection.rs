@@ -408,22 +408,22 @@ impl Connection {
         }
         let peer = self.peer.as_ref();
         let listed = peer.is_some_and(|peer| peer.listening.iter().any(|it| it == to.address()));
-        if listed || self.doubt(now, self.doubt_patience()) {
+        if listed || self.doubt(now, self.doubt_timeout()) {
             self.leads_to = Some(to.clone());
         }
     }
 
     /// Returns the time that a peer in doubt has to respond.
-    fn doubt_patience(&self) -> Duration {
-        let patience = self.limits.silence / 4;
+    fn doubt_timeout(&self) -> Duration {
+        let timeout = self.limits.silence / 4;
         match self.left {
-            true => patience.min(LEFT_TIMEOUT),
-            false => patience,
+            true => timeout.min(LEFT_TIMEOUT),
+            false => timeout,
         }
     }
 
     fn doubt_due(&self) -> Option<Instant> {
-        Some(self.doubted? + self.doubt_patience())
+        Some(self.doubted? + self.doubt_timeout())
     }
 
     /// Handles the failure to send the last datagram because of its size.
@@ -535,7 +535,7 @@ impl Connection {
             .map(|(since, _)| since + self.limits.silence);
         [
             self.received.due(),
-            self.recovery.timeout(),
+            self.recovery.timeout_at(),
             silent,
             self.doubt_due(),
             self.ping_due(),
@@ -566,7 +566,7 @@ impl Connection {
         if self.idle_due().is_some_and(|due| now >= due) {
             return Err(ConnectionEnd::Idle);
         }
-        if self.recovery.timeout().is_some_and(|due| now >= due) {
+        if self.recovery.timeout_at().is_some_and(|due| now >= due) {
             let lost = self.recovery.timed_out();
             lost.into_iter().for_each(|kept| self.lost(kept));
             if !self.recovery.is_waiting() && self.resend.is_empty() && self.urgent.is_empty() {
@@ -642,12 +642,12 @@ impl Connection {
             && self.waiting.is_empty()
             && self.arrivals.is_empty()
             && self.answers.is_empty();
-        let patience = match self.heard {
+        let timeout = match self.heard {
             Some(_) => self.limits.idle_close,
             // The connection was opened but never used.
             None => self.limits.connect_timeout.min(self.limits.idle_close),
         };
-        idle.then(|| self.busy + patience)
+        idle.then(|| self.busy + timeout)
     }
 }
 

@@ -202,8 +202,8 @@ impl Recovery {
     }
 
     /// Returns the time of the retransmission timeout.
-    pub(crate) fn timeout(&self) -> Option<Instant> {
-        (!self.sent.is_empty()).then(|| self.last_sent + self.patience())
+    pub(crate) fn timeout_at(&self) -> Option<Instant> {
+        (!self.sent.is_empty()).then(|| self.last_sent + self.retransmission_timeout())
     }
 
     /// Returns the time since which acknowledgments are missing, and the number of timeouts since.
@@ -216,7 +216,7 @@ impl Recovery {
         !self.sent.is_empty()
     }
 
-    fn patience(&self) -> Duration {
+    fn retransmission_timeout(&self) -> Duration {
         let base = match self.rtt {
             None => FIRST_TIMEOUT,
             Some(rtt) => rtt.smoothed + (rtt.variation * 4).max(GRANULARITY) + MAX_DELAY,
@@ -286,9 +286,9 @@ mod tests {
             now += Duration::from_millis(40);
             recovery.acknowledged(&ack(number), now).unwrap();
         }
-        assert_eq!(recovery.timeout(), None);
+        assert_eq!(recovery.timeout_at(), None);
         send(&mut recovery, now);
-        let wait = |recovery: &Recovery| recovery.timeout().unwrap() - now;
+        let wait = |recovery: &Recovery| recovery.timeout_at().unwrap() - now;
         let first = wait(&recovery);
         assert!(first > Duration::from_millis(55) && first < Duration::from_millis(70));
         assert_eq!(recovery.timed_out(), [SentContent::Parcel(30)]);

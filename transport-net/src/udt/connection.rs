@@ -497,11 +497,11 @@ impl Connection {
 
     /// Returns the time at which the peer counts as silent.
     fn silent_at(&self) -> Instant {
-        let patience = match &self.role {
+        let timeout = match &self.role {
             Role::Receiving(_) => self.limits.idle_close,
             _ => self.limits.silence,
         };
-        let silent = self.heard + patience;
+        let silent = self.heard + timeout;
         match self.tries >= MIN_TRIES {
             true => silent,
             // At least one more keep-alive.

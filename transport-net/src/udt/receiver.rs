@@ -495,8 +495,8 @@ impl Receiver {
 
     /// Returns the time after which a loss is reported again. It increases with each report.
     fn report_after(&self, reports: u32) -> Duration {
-        let patience = (self.round_trip.patience() + SYN).max(SHORTEST_REPORT);
-        patience * reports.saturating_add(1).min(16)
+        let timeout = (self.round_trip.timeout() + SYN).max(SHORTEST_REPORT);
+        timeout * reports.saturating_add(1).min(16)
     }
 
     fn schedule_report(&mut self, now: Instant) {
@@ -507,15 +507,15 @@ impl Receiver {
     /// Reports losses again that the peer has not repaired in time.
     fn report(&mut self, now: Instant) -> Option<Control> {
         let mut runs = Vec::new();
-        let patience = self.report_after(1) / 2;
+        let timeout = self.report_after(1) / 2;
         let mut next: Option<Instant> = None;
         for (start, gap) in &mut self.gaps {
-            let due = gap.reported + patience * gap.reports.saturating_add(1).min(16);
+            let due = gap.reported + timeout * gap.reports.saturating_add(1).min(16);
             let due = if due <= now && runs.len() < MAX_RUNS {
                 runs.push((sequence::wire(*start), sequence::wire(gap.end - 1)));
                 gap.reported = now;
                 gap.reports = gap.reports.saturating_add(1);
-                now + patience * gap.reports.saturating_add(1).min(16)
+                now + timeout * gap.reports.saturating_add(1).min(16)
             } else {
                 due.max(now + SYN)
             };
@@ -555,7 +555,7 @@ impl Receiver {
         }
         acks.sent.push_back((acks.last_number, self.next, now));
         let number = acks.last_number;
-        let repeat = self.round_trip.patience() * (1 << acks.repeats.min(5));
+        let repeat = self.round_trip.timeout() * (1 << acks.repeats.min(5));
         acks.due = Some(now + repeat.min(LONGEST_REPEAT));
         let rates = acks.rates_at.is_none_or(|at| now >= at + SYN).then(|| {
             acks.rates_at = Some(now);

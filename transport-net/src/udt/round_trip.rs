@@ -49,7 +49,7 @@ impl RoundTrip {
     }
 
     /// Returns the time in which an answer arrives, unless a packet was lost.
-    pub(crate) fn patience(&self) -> Duration {
+    pub(crate) fn timeout(&self) -> Duration {
         self.mean + 4 * self.variance + SYN
     }
 }
@@ -67,7 +67,7 @@ mod tests {
             round_trip.measured(Duration::from_millis(2));
         }
         assert!(round_trip.mean() < Duration::from_millis(3));
-        assert!(round_trip.patience() < Duration::from_millis(14));
+        assert!(round_trip.timeout() < Duration::from_millis(14));
         for _ in 0..100 {
             round_trip.measured(Duration::MAX);
         }

@@ -348,9 +348,9 @@ impl Sender {
             return None;
         }
         let sent = *self.sent_at.front()?;
-        let patience = (self.round_trip.patience() + SYN).max(SHORTEST_TIMEOUT);
-        let patience = patience.saturating_mul(1 << self.timeouts.min(8));
-        Some(sent.max(self.progress) + patience.min(LONGEST_TIMEOUT))
+        let timeout = (self.round_trip.timeout() + SYN).max(SHORTEST_TIMEOUT);
+        let timeout = timeout.saturating_mul(1 << self.timeouts.min(8));
+        Some(sent.max(self.progress) + timeout.min(LONGEST_TIMEOUT))
     }
 
     fn stalled_at(&self) -> Option<Instant> {
@@ -363,8 +363,8 @@ impl Sender {
         let Some(sent) = self.sent_at.front() else {
             return;
         };
-        let patience = (self.round_trip.patience() + SYN).max(SHORTEST_TIMEOUT / 2);
-        if self.lost.contains(self.acked) || now < *sent + patience {
+        let timeout = (self.round_trip.timeout() + SYN).max(SHORTEST_TIMEOUT / 2);
+        if self.lost.contains(self.acked) || now < *sent + timeout {
             return;
         }
         let (end, len) = self.burst;

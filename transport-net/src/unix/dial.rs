@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use bytes::BytesMut;
 use fipa_transport::{Location, Sink};
 use tokio::net::UnixStream;
-use tokio::time::timeout;
+use tokio::time;
 
 use super::directory::Directory;
 use crate::end::ConnectionEnd;
@@ -64,13 +64,13 @@ fn in_words(error: &io::Error) -> String {
 async fn connect(
     directory: &Directory,
     name: &str,
-    patience: Duration,
+    timeout: Duration,
 ) -> io::Result<(UnixStream, i32)> {
-    match timeout(patience, directory.connect(name)).await {
+    match time::timeout(timeout, directory.connect(name)).await {
         Ok(connected) => connected,
         Err(_) => Err(io::Error::new(
             io::ErrorKind::TimedOut,
-            format!("timed out connecting after {patience:?} (connect_timeout)"),
+            format!("timed out connecting after {timeout:?} (connect_timeout)"),
         )),
     }
 }

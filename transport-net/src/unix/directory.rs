@@ -245,8 +245,8 @@ impl Directory {
         }
     }
 
-    /// Locks the directory. Returns `None` when that is not possible within `patience`.
-    fn lock(&self, operation: FlockOperation, patience: Duration) -> Option<Locked> {
+    /// Locks the directory. Returns `None` when that is not possible within `timeout`.
+    fn lock(&self, operation: FlockOperation, timeout: Duration) -> Option<Locked> {
         // Opened again: a lock belongs to the open file, which the threads of a process share.
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
         let dir = rustix::fs::openat(&self.dir, ".", flags, Mode::empty()).ok()?;
@@ -254,7 +254,7 @@ impl Directory {
         loop {
             match rustix::fs::flock(&dir, operation) {
                 Ok(()) => return Some(Locked(dir)),
-                Err(Errno::WOULDBLOCK) if began.elapsed() < patience => {
+                Err(Errno::WOULDBLOCK) if began.elapsed() < timeout => {
                     std::thread::sleep(Duration::from_millis(1));
                 }
                 Err(Errno::INTR) => {}

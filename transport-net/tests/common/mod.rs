@@ -55,17 +55,17 @@ impl Drop for Threads {
     fn drop(&mut self) {
         let began = Instant::now();
         if let Some(runtime) = self.0.take() {
-            runtime.shutdown_timeout(PATIENCE);
+            runtime.shutdown_timeout(TIMEOUT);
         }
         assert!(
-            began.elapsed() < PATIENCE || std::thread::panicking(),
+            began.elapsed() < TIMEOUT || std::thread::panicking(),
             "a task blocks its thread"
         );
     }
 }
 
 /// A test that waits this long has failed.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// The name of every endpoint of the tests.
 pub(crate) const NAME: &str = "test-mts";

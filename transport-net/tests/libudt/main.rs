@@ -39,7 +39,7 @@ const LENGTHS: [usize; 12] = [
 ];
 
 /// A test that waits this long has failed.
-const PATIENCE: Duration = Duration::from_secs(120);
+const TIMEOUT: Duration = Duration::from_secs(120);
 
 const LOOPBACK: &str = "127.0.0.1";
 
@@ -156,7 +156,7 @@ impl Listener {
 
     /// Returns the content of the next letter.
     fn content(&self) -> Vec<u8> {
-        let bytes = Bytes::from(self.letters.recv_timeout(PATIENCE).unwrap());
+        let bytes = Bytes::from(self.letters.recv_timeout(TIMEOUT).unwrap());
         let (envelope, len) = Envelope::decode(&bytes).unwrap();
         let to = envelope.effective().intended_receivers;
         assert_eq!(to[0].name(), "arm");

@@ -15,7 +15,7 @@ use crate::membership;
 use crate::report::Failure;
 
 /// Time limit of the answer of the platform.
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 
 /// Lists the agents of the platform at this address.
 pub(super) fn run(
@@ -87,7 +87,7 @@ async fn management(agent: &Agent, addresses: &[String]) -> Result<AgentId, Fail
             }
         }
     };
-    match tokio::time::timeout(PATIENCE, answer).await {
+    match tokio::time::timeout(TIMEOUT, answer).await {
         Ok(Ok(sender)) if sender.name().starts_with("ams@") => {
             AgentId::new(sender.name()).map_err(|error| failed(error.to_string()))
         }

@@ -13,7 +13,7 @@ use super::super::routes::Tally;
 use super::super::rules::{self, AttemptEnd, Belief, Cause, CustodyReport};
 use super::custody::ASK_CUSTODIAN_AFTER;
 use super::delivery::{Departure, State};
-use super::{CONGESTED_TRIES, ENDED_PATIENCE, Lane, LaneKey, MOVING_PATIENCE};
+use super::{CONGESTED_TRIES, ENDED_TIMEOUT, Lane, LaneKey, MOVING_TIMEOUT};
 
 impl Lane {
     /// Handles the conclusion of an attempt.
@@ -177,7 +177,7 @@ impl Lane {
             return;
         }
         if self.moving.is_none_or(|(moved, _)| moved != registration) {
-            let until = now + MOVING_PATIENCE;
+            let until = now + MOVING_TIMEOUT;
             self.moving = Some((registration, until));
             self.due_at(until);
         }
@@ -256,7 +256,7 @@ impl Lane {
         if is_custody {
             return self.fail(now, index, FailureReason::NoSuchAgent, table);
         }
-        if now >= since + MOVING_PATIENCE {
+        if now >= since + MOVING_TIMEOUT {
             return self.fail_absent(now, index, table);
         }
         progress.tried.clear();
@@ -496,7 +496,7 @@ impl Lane {
             (Some((known, _)), Some(ended)) if known == ended => {}
             (_, Some(ended)) => {
                 self.ended = Some((ended, now));
-                self.due_at(now + ENDED_PATIENCE);
+                self.due_at(now + ENDED_TIMEOUT);
             }
         }
     }

@@ -7,7 +7,7 @@ use fipa_transport::{FailureReason, TransportError, TransportErrorKind};
 use super::super::attempts::AttemptTable;
 use super::super::work;
 use super::delivery::{Holding, State};
-use super::{ENDED_AT_ONCE, ENDED_PATIENCE, Lane};
+use super::{ENDED_AT_ONCE, ENDED_TIMEOUT, Lane};
 
 impl Lane {
     /// Handles what is due: deadlines, attempts without an answer, custody reports, and letters to
@@ -21,7 +21,7 @@ impl Lane {
         self.ask_custodians(now, table);
         let ended = self
             .ended
-            .filter(|(_, heard)| now >= *heard + ENDED_PATIENCE);
+            .filter(|(_, heard)| now >= *heard + ENDED_TIMEOUT);
         // Once for due timers, and once for the next ones.
         work::steps(2 * self.letters.len());
         let (mut index, mut answered, before) = (0, 0, self.letters.len());
@@ -121,7 +121,7 @@ impl Lane {
         let still =
             |wait: Option<(_, Instant)>| wait.map(|(_, until)| until).filter(|until| *until > now);
         let (moving, absent) = (still(self.moving), still(self.absent));
-        let ended = self.ended.map(|(_, heard)| heard + ENDED_PATIENCE);
+        let ended = self.ended.map(|(_, heard)| heard + ENDED_TIMEOUT);
         let ended = ended.filter(|due| *due > now);
         let ask = self.ask_custodian.filter(|due| *due > now);
         let others = [paused, moving, absent, ended, ask];

@@ -21,8 +21,8 @@ use super::turns::Pace;
 /// Minimum and maximum time for a missing predecessor to arrive: two round trips to the service
 /// that handed the letter over. If the predecessor takes longer, the letter travels twice, and
 /// nothing is lost.
-const LEAST_PATIENCE: Duration = Duration::from_millis(50);
-const MOST_PATIENCE: Duration = Duration::from_secs(1);
+const LEAST_TIMEOUT: Duration = Duration::from_millis(50);
+const MOST_TIMEOUT: Duration = Duration::from_secs(1);
 /// Time in custody after which the custodian is asked whether it has the letter, and the pause
 /// until it is asked again. The custodian of a receiver with a full queue is asked after the shorter time.
 pub(super) const ASK_CUSTODIAN_AFTER: Duration = Duration::from_secs(1);
@@ -75,10 +75,10 @@ impl Lane {
     }
 
     /// Maximum time for the predecessor of the letter at `index` to arrive.
-    pub(super) fn predecessor_patience(&self, index: usize, table: &AttemptTable) -> Duration {
+    pub(super) fn predecessor_timeout(&self, index: usize, table: &AttemptTable) -> Duration {
         let upstreams = self.letters[index].upstreams();
         let slowest = upstreams.filter_map(|it| table.round_trip(it)).max();
-        (slowest.unwrap_or_default() * 2).clamp(LEAST_PATIENCE, MOST_PATIENCE)
+        (slowest.unwrap_or_default() * 2).clamp(LEAST_TIMEOUT, MOST_TIMEOUT)
     }
 
     /// Schedules the question to custodians for this time at the latest.
@@ -237,7 +237,7 @@ impl Lane {
         &mut self,
         now: Instant,
         index: usize,
-        patience: Duration,
+        timeout: Duration,
         table: &mut AttemptTable,
     ) {
         let delivery = &self.letters[index];
@@ -245,7 +245,7 @@ impl Lane {
         let since = self.left.since(after).unwrap_or(delivery.since);
         let missing_for = now.saturating_duration_since(since);
         let here = self.index(after).is_some();
-        match rules::hold(here, missing_for, patience) {
+        match rules::hold(here, missing_for, timeout) {
             HoldDecision::ForPredecessor => {
                 let predecessor = self.index(after).map(|at| &self.letters[at]);
                 let attempt = predecessor.and_then(|it| it.progress.state.handed_over());

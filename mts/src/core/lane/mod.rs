@@ -61,14 +61,14 @@ const SLOWEST_BYTES_PER_SECOND: u64 = 1 << 20;
 /// out first and can still report the reason.
 const HOP_MARGIN: Duration = Duration::from_millis(100);
 /// Time for which a letter waits for the new registration of a receiver that has moved.
-const MOVING_PATIENCE: Duration = Duration::from_secs(2);
+const MOVING_TIMEOUT: Duration = Duration::from_secs(2);
 /// Time for which a letter that an attempt may have delivered waits for its receiver to return to the directory.
-const ABSENT_PATIENCE: Duration = Duration::from_secs(1);
+const ABSENT_TIMEOUT: Duration = Duration::from_secs(1);
 /// Time for which letters that were handed over for an ended registration are waited for.
-const ENDED_PATIENCE: Duration = Duration::from_secs(2);
+const ENDED_TIMEOUT: Duration = Duration::from_secs(2);
 /// Time for which a letter that is too large for the receiver's current kinds of transport waits
 /// for another kind.
-const KIND_PATIENCE: Duration = Duration::from_secs(2);
+const KIND_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Bytes that a lane with letters counts as, in addition to the letters, among the letters in custody.
 /// Its state takes about as much memory, and peers can invent senders, each with a lane.
@@ -627,7 +627,7 @@ impl Lane {
         let mut order = table.config.order_for(&self.receiver).iter();
         let is_legacy = |attempt: &Attempt| attempt.location.signature() != Signature::Frames;
         let waits = reason == FailureReason::TooLarge
-            && now < since + KIND_PATIENCE
+            && now < since + KIND_TIMEOUT
             && !attempts.iter().all(is_legacy)
             && !order.all(|kind| {
                 kind.is_host_local() || attempts.iter().any(|attempt| attempt.via == *kind)
@@ -693,7 +693,7 @@ impl Lane {
         }
         let until = match self.absent {
             Some((absent, until)) if absent == registration => until,
-            _ => now + ABSENT_PATIENCE,
+            _ => now + ABSENT_TIMEOUT,
         };
         self.absent = Some((registration, until));
         self.due_at(until);

@@ -82,11 +82,11 @@ impl Lane {
             Again::AtOnce => {}
             Again::AfterPause => self.pause(now, ends_with, least),
             Again::AfterPredecessor if self.is_custody() => {
-                let patience = match cause {
-                    Cause::OutOfOrder { .. } => self.predecessor_patience(index, table),
+                let timeout = match cause {
+                    Cause::OutOfOrder { .. } => self.predecessor_timeout(index, table),
                     _ => Duration::ZERO,
                 };
-                self.hold(now, index, patience, table);
+                self.hold(now, index, timeout, table);
             }
             Again::AfterPredecessor => {
                 let lower = index.checked_sub(1).map(|lower| &self.letters[lower]);

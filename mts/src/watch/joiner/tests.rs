@@ -105,7 +105,7 @@ fn records_of_sender_and_receiver_are_one_letter() {
     );
     joiner.handle(now, B, seen(2, id(7, 1), Seen::Taken(Some(Kind::Shm))));
     assert!(
-        all(&mut joiner, now + PATIENCE * 2).is_empty(),
+        all(&mut joiner, now + TIMEOUT * 2).is_empty(),
         "reported already"
     );
 }
@@ -114,9 +114,9 @@ fn records_of_sender_and_receiver_are_one_letter() {
 fn a_late_outcome_is_an_event_of_its_own() {
     let (mut joiner, now) = (Joiner::new(), Instant::now());
     joiner.handle(now, A, seen(1, id(7, 1), Seen::Sent(None)));
-    assert_eq!(only(all(&mut joiner, now + PATIENCE)).fate, Fate::UnderWay);
+    assert_eq!(only(all(&mut joiner, now + TIMEOUT)).fate, Fate::UnderWay);
     joiner.handle(now, A, settled(900, id(7, 1), failed(), true));
-    let later = only(all(&mut joiner, now + PATIENCE));
+    let later = only(all(&mut joiner, now + TIMEOUT));
     assert_eq!((later.number, &later.fate), (1, &Fate::Settled(failed())));
 }
 
