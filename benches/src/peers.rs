@@ -273,8 +273,8 @@ impl<'a> Side<'a> {
 
     /// Counts the replies that are still arriving.
     async fn drain(&mut self) -> Result<(), BenchError> {
-        let nobody = self.agent.id().clone();
-        self.reply(&nobody, "", SURPLUS_TIMEOUT).await.map(drop)
+        let this_agent = self.agent.id().clone();
+        self.reply(&this_agent, "", SURPLUS_TIMEOUT).await.map(drop)
     }
 }
 

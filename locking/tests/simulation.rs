@@ -96,9 +96,7 @@ fn the_messages_fit_the_protocols_that_agents_enforce() {
                 checked: true,
                 claims: 6,
             };
-            if let Err(error) = World::new(setup, seed).run() {
-                panic!("{kind}, seed {seed}: {error}");
-            }
+            ran(setup, seed);
         }
     }
 }

@@ -18,7 +18,7 @@ use crate::Identity;
 pub(crate) const MAX_HELLO: usize = 16 * 1024;
 
 /// Longest text of a location with kind and incarnation, in bytes.
-const MAX_DIALLED: usize = Location::MAX_ADDRESS + 32;
+const MAX_DIALED: usize = Location::MAX_ADDRESS + 32;
 
 /// Maximum number of listening addresses in a hello; the best come first.
 const MAX_LISTENING: usize = 16;
@@ -101,7 +101,7 @@ impl Hello {
             domain: text(&mut rest, Identity::MAX_TEXT)?,
             host: text(&mut rest, Identity::MAX_TEXT)?,
         };
-        let dialed = text(&mut rest, MAX_DIALLED)?;
+        let dialed = text(&mut rest, MAX_DIALED)?;
         let (&count, after) = rest.split_first()?;
         rest = after;
         if usize::from(count) > MAX_LISTENING {
@@ -127,7 +127,7 @@ impl Hello {
 }
 
 fn put_text(out: &mut BytesMut, text: &str) {
-    let text = fipa_transport::wire::truncated(text, MAX_DIALLED);
+    let text = fipa_transport::wire::truncated(text, MAX_DIALED);
     out.put_u16_le(text.len() as u16);
     out.put_slice(text.as_bytes());
 }
@@ -190,7 +190,7 @@ pub(crate) mod tests {
     #[test]
     fn the_longest_hello_fits() {
         let mut hello = sample(7);
-        hello.dialed = "x".repeat(MAX_DIALLED);
+        hello.dialed = "x".repeat(MAX_DIALED);
         hello.listening = vec!["x".repeat(Location::MAX_ADDRESS); MAX_LISTENING + 1];
         let body = hello.encode();
         assert!(body.len() <= MAX_HELLO);
