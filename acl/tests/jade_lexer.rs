@@ -272,7 +272,7 @@ fn jade_reads_every_text_of_every_parameter_as_it_was_written() {
     }
     assert!(
         missing.is_empty(),
-        "record these with comparison/jade/ReadTexts.java:\n{missing}"
+        "record these with benches/comparison/jade/ReadTexts.java:\n{missing}"
     );
     assert!(wrong.is_empty(), "JADE reads other texts:\n{wrong}");
     let unexpected = refused

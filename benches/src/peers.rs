@@ -2,7 +2,7 @@
 //!
 //! An echo agent of JADE answers requests with the same content. This side asks it through the gateway
 //! of the host. An agent of a second JADE platform asks the same echo agent in turn, so other load
-//! of the machine affects both alike. `comparison/jade` has the two agents.
+//! of the machine affects both alike. `benches/comparison/jade` has the two agents.
 
 use std::collections::HashSet;
 use std::time::{Duration, Instant};

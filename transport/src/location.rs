@@ -103,7 +103,6 @@ impl FromStr for Kind {
 /// The protocol at a location: the signature type of a service locator (FIPA00001), which legacy
 /// peers call the signature of a location.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
-#[non_exhaustive]
 pub enum Signature {
     /// Frames of this project, acknowledged.
     #[default]

@@ -122,7 +122,6 @@ pub enum Body {
 
 /// The end of the custody of a letter.
 #[derive(Debug, Clone, PartialEq, Eq)]
-#[non_exhaustive]
 pub enum Report {
     /// The letter has an outcome, which its sender must get, with the attempts made during the
     /// custody.

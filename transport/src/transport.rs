@@ -340,8 +340,9 @@ pub enum Verdict {
 }
 
 /// The other side's answer to a parcel.
+///
+/// Exhaustive: a new answer compiles only after every transport and the core know what it means.
 #[derive(Debug, Clone, PartialEq, Eq)]
-#[non_exhaustive]
 pub enum Answer {
     /// Accepted into the named agent's queue, now or when an earlier copy arrived. Reports and
     /// credits are accepted, too.
@@ -423,7 +424,6 @@ impl Abandoned {
 
 /// The end of an attempt.
 #[derive(Debug, Clone, PartialEq, Eq)]
-#[non_exhaustive]
 pub enum Conclusion {
     /// The other side answered.
     Answered(Answer),

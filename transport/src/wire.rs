@@ -2,11 +2,13 @@
 //!
 //! A parcel is a [`ParcelHeader`] followed by a body: the receiver's name, then the content of the
 //! [`Body`]. All integers are little-endian. A letter is its envelope, then the message in its
-//! three pieces ([`Payload`]). [`write_report`] defines the bytes of a report. Credits and
+//! three pieces ([`Payload`]). [`write_report`] defines the bytes of a report, [`write_answer`] those of an answer. Credits and
 //! predecessors have only the name.
 //!
 //! All input may come from a hostile peer: lengths are checked against the available bytes before
 //! they are used, and no memory is allocated according to them.
+
+mod answer;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,6 +22,8 @@ use crate::{
     Arriving, Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Realm,
     Report, Stream, TransportError, TransportErrorKind,
 };
+
+pub use self::answer::{MAX_ANSWER_LEN, answer_len, read_answer, write_answer};
 
 /// The header of a parcel: [`HEADER_LEN`] bytes, little-endian.
 #[derive(

@@ -2,7 +2,7 @@
 //! executes orders.
 //!
 //! The file uses nothing of `fipa`: programs that measure another middleware include it
-//! (`comparison/zenoh`).
+//! (`benches/comparison/zenoh`).
 
 use std::collections::BTreeMap;
 use std::io::Write as _;

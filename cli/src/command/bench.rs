@@ -38,7 +38,7 @@ Examples:
   fipa bench net --json | jq '.rows[] | {path, size, p50: .one_way_us.p50, ratio}'
   fipa bench --svg latency.svg
   fipa bench --json > before.json; fipa bench --baseline before.json
-  fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
+  fipa bench --zenoh benches/comparison/zenoh/target/release/fipa-comparison-zenoh
   fipa bench paper --dir docs
   fipa bench locks --quick
   fipa bench locks --agents 2,16 --json | jq '.rows[] | {algorithm, agents, hosts, letters, ratio}'
@@ -77,13 +77,13 @@ pub(crate) struct Arguments {
     /// Directory for the tables and drawings of `paper` [default: docs]
     #[arg(long, value_name = "DIRECTORY")]
     dir: Option<PathBuf>,
-    /// Also measure zenoh in the same rounds, with this program (see comparison/zenoh)
+    /// Also measure zenoh in the same rounds, with this program (see benches/comparison/zenoh)
     #[arg(long, value_name = "PROGRAM")]
     zenoh: Option<PathBuf>,
     /// Address of the JADE platform that runs the agent of --echo, for `peers`
     ///
     /// `peers` measures conversations of 100 bytes in a row with that agent, through the gateway of this
-    /// host (`fipa up` with the transport http). comparison/jade has the agents for JADE.
+    /// host (`fipa up` with the transport http). benches/comparison/jade has the agents for JADE.
     #[arg(long, value_name = "ADDRESS", value_parser = membership::address)]
     jade: Option<String>,
     /// Address of a second JADE platform, whose agent --asker asks the same agent in turn
@@ -403,7 +403,7 @@ fn failed(error: BenchError) -> Failure {
             "check mts.transports (`fipa config show`), and run the command with -v for the logs"
         }
         BenchError::Peer { .. } => {
-            "check that JADE runs with the agents of comparison/jade, and the gateway with http"
+            "check that JADE runs with the agents of benches/comparison/jade, and the gateway with http"
         }
         BenchError::Read { .. } => "check the name of the file",
         BenchError::Baseline { .. } => "make a baseline with `fipa bench --json > FILE`",
@@ -467,7 +467,7 @@ fn program(given: &Path) -> Result<PathBuf, Failure> {
         Failure::wrong_usage(
             format!("cannot find {}: {error}", given.display()),
             "--zenoh",
-            "build the program: cargo build --release --manifest-path comparison/zenoh/Cargo.toml",
+            "build the program: cargo build --release --manifest-path benches/comparison/zenoh/Cargo.toml",
         )
     })
 }

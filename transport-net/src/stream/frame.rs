@@ -6,7 +6,7 @@
 //! |---|---|---|
 //! | 1 hello | 0 | see [`crate::hello`] |
 //! | 2 parcel | the sender's number of the parcel, increasing | [`ParcelHeader`], then its body |
-//! | 3 answer | the parcel it answers | see [`crate::answer`] |
+//! | 3 answer | the parcel it answers | see [`fipa_transport::wire::write_answer`] |
 //! | 4 ping, 5 pong | 0 | none |
 //! | 6 goodbye | the last accepted parcel; later ones are never accepted | none |
 //!
@@ -20,12 +20,13 @@
 mod reader;
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
-use fipa_transport::wire::{HEADER_LEN as PARCEL_HEADER_LEN, ParcelHeader, WireError};
+use fipa_transport::wire::{
+    self, HEADER_LEN as PARCEL_HEADER_LEN, MAX_ANSWER_LEN, ParcelHeader, WireError,
+};
 use fipa_transport::{Answer, Parcel};
 use zerocopy::little_endian::{U16, U64};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
-use crate::answer::{self, MAX_ANSWER};
 use crate::hello::{Hello, MAX_HELLO};
 
 pub(crate) use self::reader::{FrameReader, Placed, Space};
@@ -137,9 +138,9 @@ pub(crate) fn parcel(id: u64, parcel: &Parcel) -> Result<Vec<Bytes>, WireError> 
 
 /// Encodes an answer.
 pub(crate) fn answer(id: u64, answer: &Answer) -> Bytes {
-    let mut frame = BytesMut::with_capacity(HEADER_LEN + MAX_ANSWER);
-    put_header(&mut frame, ANSWER, id, answer::len(answer) as u64);
-    answer::encode(answer, &mut frame);
+    let mut frame = BytesMut::with_capacity(HEADER_LEN + MAX_ANSWER_LEN);
+    put_header(&mut frame, ANSWER, id, wire::answer_len(answer) as u64);
+    wire::write_answer(answer, &mut frame);
     frame.freeze()
 }
 
@@ -181,7 +182,7 @@ impl FrameHeader {
         let (min, max) = match self.kind {
             HELLO => (0, MAX_HELLO as u64),
             PARCEL => (PARCEL_HEADER_LEN as u64, max_parcel),
-            ANSWER => (0, MAX_ANSWER as u64),
+            ANSWER => (0, MAX_ANSWER_LEN as u64),
             PING | PONG | GOODBYE => (0, 0),
             other => return Err(FrameError::Kind(other)),
         };
@@ -209,7 +210,7 @@ fn finish(header: FrameHeader, mut body: Bytes) -> Result<Frame, FrameError> {
             Frame::Parcel { id, parcel }
         }
         ANSWER => {
-            let answer = answer::decode(&body).ok_or(FrameError::Answer)?;
+            let answer = wire::read_answer(&body).ok_or(FrameError::Answer)?;
             Frame::Answer { id, answer }
         }
         PING => Frame::Ping,

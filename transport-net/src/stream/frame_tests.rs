@@ -264,7 +264,7 @@ fn bytes_that_are_not_a_frame_are_refused_at_once() {
         (PARCEL, 79),
         (PARCEL, (1 << 20) + PARCEL_ALLOWANCE + 1),
         (PARCEL, u64::MAX),
-        (ANSWER, MAX_ANSWER as u64 + 1),
+        (ANSWER, MAX_ANSWER_LEN as u64 + 1),
         (PING, 1),
         (GOODBYE, 1),
     ] {

@@ -13,7 +13,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::{Bytes, BytesMut};
-use fipa_transport::wire::ParcelHeader;
+use fipa_transport::wire::{self, ParcelHeader};
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Body, Conclusion, Incarnation, Location, Parcel, TransportError,
     TransportErrorKind,
@@ -322,8 +322,8 @@ impl Connection {
     /// Answers a parcel that arrived. An unknown number is ignored.
     pub(crate) fn answer(&mut self, id: u64, answer: &Answer, now: Instant) {
         if self.arrivals.remove(&id) {
-            let mut body = BytesMut::with_capacity(answer::len(answer));
-            answer::encode(answer, &mut body);
+            let mut body = BytesMut::with_capacity(wire::answer_len(answer));
+            wire::write_answer(answer, &mut body);
             self.answers.insert(id, body.freeze());
             self.urgent.push_back(SentContent::Answer(id));
             self.busy = now;

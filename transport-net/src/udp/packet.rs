@@ -19,7 +19,7 @@
 //! | 0 padding | ignored, to the end |
 //! | 1 acknowledgment | highest packet (8), its delay in µs (4), length n (1), n bytes: bit i is set if the packet i + 1 below it arrived |
 //! | 2 parcel | its number, increasing by one (8), [`ParcelHeader`], its body, to the end |
-//! | 3 answer | the parcel it answers (8), length (1), see [`crate::answer`] |
+//! | 3 answer | the parcel it answers (8), length (1), see [`fipa_transport::wire::write_answer`] |
 //! | 4 ping | nothing; is acknowledged |
 //! | 5 skipped | the number of a parcel that never comes (8) |
 //! | 6 goodbye | the last accepted parcel; later ones are never accepted (8) |
@@ -29,11 +29,10 @@
 
 use bytes::{Buf, BufMut};
 use fipa_transport::Answer;
-use fipa_transport::wire::{HEADER_LEN as PARCEL_HEADER_LEN, ParcelHeader};
+use fipa_transport::wire::{self, HEADER_LEN as PARCEL_HEADER_LEN, MAX_ANSWER_LEN, ParcelHeader};
 use zerocopy::little_endian::{U16, U64};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
-use crate::answer::{self, MAX_ANSWER};
 use crate::hello::Hello;
 
 /// Size of a datagram that every path must carry (RFC 8200 section 5: 1,280 bytes, less the headers
@@ -359,12 +358,12 @@ impl<'a> Frames<'a> {
             ANSWER => {
                 let id = rest.try_get_u64_le().ok()?;
                 let len = usize::from(rest.try_get_u8().ok()?);
-                if len > MAX_ANSWER {
+                if len > MAX_ANSWER_LEN {
                     return None;
                 }
                 let (body, after) = rest.split_at_checked(len)?;
                 *rest = after;
-                let answer = answer::decode(body)?;
+                let answer = wire::read_answer(body)?;
                 Frame::Answer { id, answer }
             }
             PING => Frame::Ping,
@@ -451,7 +450,7 @@ mod tests {
         };
         let answer = Answer::failed(FailureReason::QueueFull, "é".repeat(80));
         let mut body = bytes::BytesMut::new();
-        answer::encode(&answer, &mut body);
+        wire::write_answer(&answer, &mut body);
         let mut out = Vec::new();
         put_ack(&mut out, &ack);
         put_answer(&mut out, 8, &body);

@@ -84,12 +84,6 @@ impl Lane {
                 self.letters[index].ended(AttemptEnd::Unknown);
                 self.came_back(now, index, &location, (error, Cause::Unconfirmed), table);
             }
-            _ => {
-                let text = "the transport reported an unknown conclusion of the attempt";
-                self.letters[index].ended(AttemptEnd::Unknown);
-                let error = TransportError::new(TransportErrorKind::Incompatible, text);
-                self.came_back(now, index, &location, (error, Cause::Unconfirmed), table);
-            }
         }
         self.pump(now, table);
     }
@@ -155,11 +149,6 @@ impl Lane {
             }
             Answer::Failed { reason, detail } => {
                 self.refused(now, index, &location, (reason, detail), table);
-            }
-            _ => {
-                let detail = "the receiving service gave an unknown answer".to_owned();
-                let refused = (FailureReason::Refused, detail);
-                self.refused(now, index, &location, refused, table);
             }
         }
     }
@@ -376,7 +365,6 @@ impl Lane {
                 self.again(now, index, Cause::Returned, table);
             }
             Report::Moved => self.receiver_moved(now, index, table),
-            _ => self.fail(now, index, FailureReason::Unconfirmed, table),
         }
         self.pump(now, table);
     }

@@ -22,7 +22,7 @@ mod orders;
 
 /// Run the zenoh sender or receiver of a measurement; `fipa bench --zenoh` starts this program
 ///
-/// Example: fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
+/// Example: fipa bench --zenoh benches/comparison/zenoh/target/release/fipa-comparison-zenoh
 #[derive(Debug, Parser)]
 struct Arguments {
     /// Sender or receiver
