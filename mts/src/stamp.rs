@@ -36,13 +36,7 @@ pub(crate) struct EnvelopeParts {
 }
 
 /// Reads the envelope for the service with this name and incarnation.
-pub(crate) fn read(
-    letter: &Letter,
-    name: &str,
-    incarnation: Incarnation,
-) -> Result<EnvelopeParts, DecodeError> {
-    let envelope = letter.envelope();
-    let view = EnvelopeView::parse(&envelope)?;
+pub(crate) fn read(view: &EnvelopeView, name: &str, incarnation: Incarnation) -> EnvelopeParts {
     let id = incarnation.to_string();
     let (mut is_loop, mut stamps) = (false, 0);
     for stamp in view.stamps() {
@@ -51,11 +45,11 @@ pub(crate) fn read(
         is_loop |= is_own && stamp.id().is_some_and(|it| it.as_str() == id);
     }
     let sender = view.from_name().map(|name| name.as_str().into_owned());
-    Ok(EnvelopeParts {
+    EnvelopeParts {
         is_loop,
         stamps,
         sender,
-    })
+    }
 }
 
 /// Adds the stamp of this service in front of the letter, which came from this peer.

@@ -29,9 +29,7 @@ pub(super) fn too_long(letter: &Letter) -> Option<String> {
 /// Returns the reason why a letter is refused for a name in it, if it is: no agent has a name with control
 /// characters or invisible ones, and rules, logs and programs need not expect one. Decoders accept such
 /// names, because recordings have them.
-fn refused_name(letter: &Letter) -> Option<String> {
-    let envelope = letter.envelope();
-    let envelope = EnvelopeView::parse(&envelope).ok();
+fn refused_name(letter: &Letter, envelope: Option<&EnvelopeView>) -> Option<String> {
     let envelope = envelope.iter().flat_map(|envelope| {
         let receivers = envelope.receivers();
         envelope.from_name().into_iter().chain(receivers)
@@ -130,12 +128,14 @@ impl LetterReader {
             return None;
         }
         work::steps(letter.len() / 512);
+        let envelope = letter.envelope();
+        let envelope = EnvelopeView::parse(&envelope);
         Some(Box::new(ReadLetter {
-            fault: refused_name(letter),
+            fault: refused_name(letter, envelope.as_ref().ok()),
             parts: self.parts(letter),
             envelope: self
                 .forwards
-                .then(|| stamp::read(letter, &self.name, self.incarnation)),
+                .then(|| envelope.map(|it| stamp::read(&it, &self.name, self.incarnation))),
         }))
     }
 

@@ -1,293 +1,127 @@
-//! Reports of routes: the locations to which a letter would go now, and counters of each location
-//! since the start. The allocation of memory for a letter in advance also uses them.
+//! The choice of a route: the location of a receiver that its next letter goes to, and the failures that
+//! put a location back.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Instant;
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
 
-use fipa_sds::{Entry, Reach, Resolution, Role};
-use fipa_transport::{Incarnation, Kind, Location};
-use parking_lot::Mutex;
-use serde::{Deserialize, Serialize};
+use fipa_sds::Entry;
+use fipa_transport::{Kind, Location, Signature};
 
-use super::attempts::{self, AttemptTable, leads_to_letters};
-use super::{Core, Now};
-use crate::{Map, stamp};
+use crate::Map;
 
-/// The route that letters to one agent would take now.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Route {
-    /// The agent's name.
-    pub receiver: String,
-    /// Its incarnation.
-    pub incarnation: Incarnation,
-    /// The gateway to which letters go, when the agent is on another host.
-    pub gateway: Option<Incarnation>,
-    /// The pattern of `[routes]` that applies, or `None` for the order of `mts.transports`.
-    pub exception: Option<String>,
-    /// Its locations, in the order in which they would be tried. Unused ones come last.
-    pub ways: Vec<RouteCandidate>,
-}
-
-/// A location of an agent, as seen from one service.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RouteCandidate {
-    /// The location.
-    pub location: Location,
-    /// State of the location.
-    pub standing: Standing,
-}
-
-/// State of a location for letters.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(tag = "standing", rename_all = "snake_case")]
-#[non_exhaustive]
-pub enum Standing {
-    /// Not known to fail.
-    Ready,
-    /// It failed, and is tried after all working ones until this time has passed.
-    Failing {
-        /// Remaining time of its backoff.
-        milliseconds: u64,
-        /// Number of consecutive failures.
-        failures: u32,
-        /// The latest error.
-        error: String,
-    },
-    /// Its transport is not in the order for this receiver.
-    NotInOrder,
-    /// This project has no transport of its kind.
-    Unsupported,
-}
-
-/// Counters of one location since the service started, or since the location was last dropped.
-/// Beyond 4096 locations, those without letters in flight are dropped.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RouteState {
-    /// The location.
-    pub location: Location,
-    /// Its current state.
-    #[serde(flatten)]
-    pub standing: Standing,
-    /// Number of letters that were sent there and have no answer yet.
-    pub in_flight: u64,
-    /// Number of attempts to send a letter there.
-    pub tried: u64,
-    /// Number of letters that the other side took, into a queue or into custody, or that were
-    /// handed to a peer that cannot confirm.
-    pub taken: u64,
-    /// Number of letters that the other side did not take, because its queue was full or for
-    /// another reason.
-    pub turned_back: u64,
-    /// Number of failed attempts: no connection, or no answer.
-    pub failed: u64,
-    /// Error of the last of these.
-    pub last_error: Option<String>,
-    /// Seconds since that error.
-    pub last_error_seconds: Option<u64>,
-}
-
-/// Counters of one location.
+/// The health of the locations to which letters go.
 #[derive(Debug, Default)]
-pub(crate) struct Tally {
-    pub(super) tried: AtomicU64,
-    pub(super) ended: AtomicU64,
-    pub(super) taken: AtomicU64,
-    pub(super) turned_back: AtomicU64,
-    pub(super) failed: AtomicU64,
-    last_error: Mutex<Option<(String, Instant)>>,
+pub(crate) struct Routes {
+    health: Map<Location, Health>,
+    /// The latest locations that their services have left for others.
+    left: VecDeque<Location>,
 }
 
-/// Counters of all locations.
-#[derive(Debug, Default)]
-pub(super) struct Tallies(Map<Location, Arc<Tally>>);
-
-/// Maximum number of locations with counters.
-const MAX_TALLIES: usize = 4096;
-
-impl Tally {
-    /// Increments a counter by one. Only the core writes its counters, which its caller has locked.
-    pub(super) fn add(counter: &AtomicU64) {
-        let before = counter.load(Ordering::Relaxed);
-        counter.store(before.wrapping_add(1), Ordering::Relaxed);
-    }
-
-    pub(super) fn fail(&self, now: Instant, error: &impl std::fmt::Display) {
-        Self::add(&self.failed);
-        *self.last_error.lock() = Some((error.to_string(), now));
-    }
-
-    fn in_flight(&self) -> u64 {
-        let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        read(&self.tried).saturating_sub(read(&self.ended))
-    }
+#[derive(Debug)]
+struct Health {
+    failures: u32,
+    retry_at: Instant,
 }
 
-impl Tallies {
-    /// Counters of this location. Beyond the limit, those without letters in flight are dropped.
-    pub(super) fn of(&mut self, location: &Location) -> Arc<Tally> {
-        if let Some(tally) = self.0.get(location) {
-            return Arc::clone(tally);
-        }
-        if self.0.len() >= MAX_TALLIES {
-            self.0.retain(|_, tally| tally.in_flight() > 0);
-        }
-        let tally = Arc::default();
-        if self.0.len() < MAX_TALLIES {
-            self.0.insert(location.clone(), Arc::clone(&tally));
-        }
-        tally
-    }
-}
+/// Backoff of a failed route.
+const LONGEST_PENALTY: Duration = Duration::from_secs(5);
 
-impl AttemptTable {
-    /// The route that letters to this agent would take now.
-    pub(super) fn route(&self, now: Instant, entry: &Entry) -> Route {
-        let (exception, order) = self.config.route_for(&entry.name);
-        let mut ways = Vec::new();
-        let mut tried: Vec<Location> = Vec::new();
-        while let Some(location) = self.choose(now, entry, &tried) {
-            let standing = self.standing(now, &location);
-            tried.push(location.clone());
-            ways.push(RouteCandidate { location, standing });
+const FIRST_PENALTY: Duration = Duration::from_millis(100);
+
+/// Maximum number of locations that are remembered after their services have left them.
+const MAX_LEFT: usize = 64;
+
+/// Maximum number of failed routes that are remembered.
+const MAX_HEALTH: usize = 4096;
+
+impl Routes {
+    /// Records a location that its service has left for another one.
+    pub(super) fn left(&mut self, location: &Location) {
+        self.left.retain(|other| other != location);
+        if self.left.len() >= MAX_LEFT {
+            self.left.pop_front();
         }
-        let rest = entry.locations.iter().filter(|it| !tried.contains(it));
-        debug_assert!(
-            rest.clone()
-                .all(|it| !order.contains(&it.kind()) || !leads_to_letters(it))
-        );
-        ways.extend(rest.map(|location| RouteCandidate {
-            location: location.clone(),
-            standing: match location.kind().is_supported() {
-                true => Standing::NotInOrder,
-                false => Standing::Unsupported,
-            },
-        }));
-        Route {
-            receiver: entry.name.to_string(),
-            incarnation: entry.incarnation,
-            gateway: match entry.reach {
-                Reach::Local => None,
-                Reach::Remote { gateway } => Some(gateway),
-            },
-            exception: exception.map(ToString::to_string),
-            ways,
-        }
+        self.left.push_back(location.clone());
     }
 
-    fn standing(&self, now: Instant, location: &Location) -> Standing {
-        match self.failing(now, location) {
-            None => Standing::Ready,
-            Some((failures, retry_at)) => {
-                let left = retry_at.saturating_duration_since(now);
-                let tally = self.tallies.0.get(location);
-                let error = tally.and_then(|tally| tally.last_error.lock().clone());
-                Standing::Failing {
-                    milliseconds: u64::try_from(left.as_millis()).unwrap_or(u64::MAX),
-                    failures,
-                    error: error.map(|(text, _)| text).unwrap_or_default(),
+    /// Whether the service at this location has recently left it for another one.
+    pub(crate) fn has_left(&self, location: &Location) -> bool {
+        self.left.contains(location)
+    }
+
+    /// Returns the best location of this receiver that is not in `tried`: by this order of transports,
+    /// with recently failed ones last.
+    pub(crate) fn choose(
+        &self,
+        now: Instant,
+        order: &[Kind],
+        entry: &Entry,
+        tried: &[Location],
+    ) -> Option<Location> {
+        let ways = order.iter().flat_map(|kind| {
+            entry
+                .locations
+                .iter()
+                .filter(move |location| location.kind() == *kind)
+        });
+        let untried =
+            ways.filter(|location| leads_to_letters(location) && !tried.contains(location));
+        // The first healthy route; without one, the route that may be retried soonest.
+        let mut fallback: Option<(&Location, Instant)> = None;
+        for location in untried {
+            match self.health.get(location) {
+                Some(health) if health.retry_at > now => {
+                    if fallback.is_none_or(|(_, soonest)| health.retry_at < soonest) {
+                        fallback = Some((location, health.retry_at));
+                    }
                 }
+                _ => return Some(location.clone()),
             }
         }
+        fallback.map(|(location, _)| location.clone())
     }
 
-    /// The counters of each location, sorted by location.
-    pub(super) fn way_states(&self, now: Instant) -> Vec<RouteState> {
-        let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        let tallies = self.tallies.0.iter();
-        let mut states: Vec<RouteState> = tallies
-            .map(|(location, tally)| {
-                let last_error = tally.last_error.lock().clone();
-                let ago = |at: Instant| now.saturating_duration_since(at);
-                RouteState {
-                    location: location.clone(),
-                    standing: self.standing(now, location),
-                    in_flight: tally.in_flight(),
-                    tried: read(&tally.tried),
-                    taken: read(&tally.taken),
-                    turned_back: read(&tally.turned_back),
-                    failed: read(&tally.failed),
-                    last_error_seconds: last_error.as_ref().map(|(_, at)| ago(*at).as_secs()),
-                    last_error: last_error.map(|(text, _)| text),
-                }
-            })
-            .collect();
-        states.sort_unstable_by(|a, b| a.location.cmp(&b.location));
-        states
+    /// Number of consecutive failures of this route, and the end of its backoff, if it is in
+    /// backoff.
+    pub(super) fn failing(&self, now: Instant, location: &Location) -> Option<(u32, Instant)> {
+        let health = self.health.get(location)?;
+        (health.retry_at > now).then_some((health.failures, health.retry_at))
+    }
+
+    /// Records that a letter was taken at this location.
+    pub(crate) fn worked(&mut self, location: &Location) {
+        if !self.health.is_empty() {
+            self.health.remove(location);
+        }
+    }
+
+    /// Drops the recorded failures of these routes. Returns whether there were any.
+    pub(super) fn forget_failures(&mut self, which: impl Fn(&Location) -> bool) -> bool {
+        let before = self.health.len();
+        self.health.retain(|location, _| !which(location));
+        self.health.len() < before
+    }
+
+    /// Records a failed attempt at this location, which puts it back for a time that doubles.
+    pub(super) fn failed(&mut self, now: Instant, location: &Location) {
+        if self.health.len() >= MAX_HEALTH && !self.health.contains_key(location) {
+            self.health.retain(|_, health| health.retry_at > now);
+            if self.health.len() >= MAX_HEALTH {
+                return;
+            }
+        }
+        let health = self.health.entry(location.clone()).or_insert(Health {
+            failures: 0,
+            retry_at: now,
+        });
+        let penalty = FIRST_PENALTY.saturating_mul(1 << health.failures.min(10));
+        health.failures += 1;
+        health.retry_at = now + penalty.min(LONGEST_PENALTY);
     }
 }
 
-impl Core {
-    /// Returns the route that letters from here to the agent of this entry would take now.
-    #[must_use]
-    pub fn route(&self, now: Now, entry: &Entry) -> Route {
-        self.table.route(now.instant, entry)
-    }
-
-    /// Returns the counters of each location, sorted by location.
-    #[must_use]
-    pub fn ways(&self, now: Now) -> Vec<RouteState> {
-        self.table.way_states(now.instant)
-    }
-
-    /// Returns the first location to which a letter from here to this receiver would go now; `None`
-    /// for several receivers.
-    #[must_use]
-    pub fn first_way(&self, now: Now, receiver: &str) -> Option<Location> {
-        let entry = self.table.view.named(receiver)?;
-        if matches!(entry.role, Role::Coalition(_)) {
-            return None;
-        }
-        self.table.choose(now.instant, &entry, &[])
-    }
-
-    /// Returns the first location to which this service would forward a letter for this
-    /// registration and name now, and the length of its stamp in bytes. `None` unless the receiver
-    /// is another process of this host.
-    #[must_use]
-    pub fn first_way_onwards(
-        &self,
-        now: Now,
-        registration: Incarnation,
-        receiver: &str,
-    ) -> Option<(Location, usize)> {
-        let config = &self.table.config;
-        if !config.forwards || self.agents.contains_key(&registration) {
-            return None;
-        }
-        let entry = self.table.receiver(registration, receiver)?;
-        let here = entry.role == Role::Agent && entry.reach == Reach::Local;
-        let way = here.then(|| self.table.choose(now.instant, &entry, &[]))?;
-        Some((way?, stamp::max_len(&config.name)))
-    }
-
-    /// Returns the kind of transport that would come first for most of these receivers now, if that
-    /// applies to at least two of them.
-    #[must_use]
-    pub fn kind_for_many<'a>(
-        &self,
-        now: Now,
-        sender: Incarnation,
-        receivers: impl IntoIterator<Item = &'a str>,
-    ) -> Option<Kind> {
-        let view = &*self.table.view;
-        let own = self.agents.get(&sender).map(|inbox| &*inbox.name);
-        let mut reached = Map::default();
-        for receiver in receivers {
-            let entries = match fipa_sds::resolve(view, receiver, own.unwrap_or_default()) {
-                Ok(Resolution::Exact(entry)) => vec![entry],
-                Ok(Resolution::Multicast(entries)) => entries,
-                Ok(Resolution::Coalition { agents, .. }) => agents,
-                Ok(Resolution::None) | Err(_) => Vec::new(),
-            };
-            for entry in entries {
-                if let Some(way) = self.table.choose(now.instant, &entry, &[]) {
-                    reached.insert(attempts::registration_of(&entry), way.kind());
-                }
-            }
-        }
-        let by = |kind: Kind| reached.values().filter(|other| **other == kind).count();
-        let most = Kind::ALL.into_iter().max_by_key(|kind| by(*kind))?;
-        (by(most) > 1).then_some(most)
-    }
+/// Whether letters may be sent to a location. A service of this project is not reached in the dialect
+/// of legacy peers, whose letters have no number: it could not recognize one that is repeated.
+pub(super) fn leads_to_letters(location: &Location) -> bool {
+    location.signature() == Signature::Frames || !location.incarnation().is_known()
 }

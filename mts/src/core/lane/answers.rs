@@ -8,9 +8,10 @@ use fipa_transport::{
     Report, Signature, TransportError, TransportErrorKind,
 };
 
-use super::super::attempts::{AttemptTable, Settlement, registration_of};
-use super::super::routes::Tally;
+use super::super::attempts::{AttemptTable, registration_of};
+use super::super::route_report::Tally;
 use super::super::rules::{self, AttemptEnd, Belief, Cause, CustodyReport};
+use super::super::settlement::Settlement;
 use super::custody::ASK_CUSTODIAN_AFTER;
 use super::delivery::{Departure, State};
 use super::{CONGESTED_TRIES, ENDED_TIMEOUT, Lane, LaneKey, MOVING_TIMEOUT};
@@ -56,7 +57,7 @@ impl Lane {
                         _ => &tally.turned_back,
                     });
                 }
-                table.route_worked(&location);
+                table.routes.worked(&location);
                 self.route_worked(&location);
                 self.answered(now, index, (attempt, location), answer, table);
             }
@@ -64,7 +65,7 @@ impl Lane {
                 if let Some(tally) = self.tally() {
                     Tally::add(&tally.taken);
                 }
-                table.route_worked(&location);
+                table.routes.worked(&location);
                 self.route_worked(&location);
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
                 let via = location.kind();
@@ -335,8 +336,8 @@ impl Lane {
                 uncertain: *uncertain,
             },
             Report::Moved => CustodyReport::NotDelivered { uncertain: false },
-            // An unknown report of a later version carries no information.
-            _ => CustodyReport::NotDelivered { uncertain: true },
+            // An unknown outcome of a later version carries no information.
+            Report::Settled(_) => CustodyReport::NotDelivered { uncertain: true },
         };
         let handed = delivery.was_handed_to(from);
         let current = delivery.progress.state.handed_over();
@@ -381,7 +382,7 @@ impl Lane {
             table.drop_attempt(location.clone(), attempt);
             // A report of an earlier hand-over does not show that this route works.
             if attempt.0 == transfer {
-                table.route_worked(&location);
+                table.routes.worked(&location);
                 if let Some(tally) = self.tally() {
                     Tally::add(&tally.taken);
                 }
@@ -516,7 +517,7 @@ impl Lane {
         let service = location.incarnation();
         let stands = |route: &Location| route.incarnation() == service;
         let is_there = entry.locations.iter().any(stands);
-        let has_left = || table.has_left(location) && !entry.locations.contains(location);
+        let has_left = || table.routes.has_left(location) && !entry.locations.contains(location);
         let is_under_way = matches!(delivery.progress.state, State::UnderWay { .. });
         if !service.is_known() || (is_there && !(is_under_way && has_left())) {
             return;

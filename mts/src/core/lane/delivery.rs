@@ -9,8 +9,10 @@ use fipa_transport::{
 };
 use smallvec::SmallVec;
 
-use super::super::attempts::{Action, AttemptTable, Origin, Upstream};
+use super::super::action::Action;
+use super::super::attempts::AttemptTable;
 use super::super::rules::{self, AttemptEnd};
+use super::super::settlement::{Origin, Upstream};
 use super::turns::{HandOvers, Pace, Turn};
 
 /// Maximum number of failed attempts in one letter's outcome.

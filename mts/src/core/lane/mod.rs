@@ -39,11 +39,11 @@ pub(crate) use self::delivery::Delivery;
 use self::delivery::State;
 use self::pause::Pause;
 pub(crate) use self::pause::PauseEnd;
-use super::attempts::{
-    AttemptTable, FailureTarget, Origin, Purpose, Settlement, Undelivered, registration_of,
-};
-use super::routes::Tally;
+use super::attempts::{AttemptTable, Purpose, registration_of};
+use super::failures::{FailureTarget, Undelivered};
+use super::route_report::Tally;
 use super::rules;
+use super::settlement::{Origin, Settlement};
 use super::work;
 
 /// A lane from which a letter has left within this time moves. It holds back this many times the letters of a lane
@@ -283,7 +283,9 @@ impl Lane {
 
     /// Whether the letters in custody leave room for another one with this many bytes in this lane.
     pub(crate) fn fits_into_custody(&self, len: usize, table: &AttemptTable) -> bool {
-        table.has_room(&self.receiver, self.counted(len))
+        table
+            .custody
+            .has_room(&self.receiver, self.counted(len), &table.config)
     }
 
     /// Bytes that count in custody when a letter of this many bytes comes or goes: its own and, when it is the only
@@ -298,9 +300,14 @@ impl Lane {
 
     /// Whether a custodian takes this letter. A letter below a waiting one is taken beyond the
     /// limits, up to twice as much.
-    pub(crate) fn admits(&self, sequence: u64, len: usize, table: &AttemptTable) -> bool {
+    pub(crate) fn takes_into_custody(
+        &self,
+        sequence: u64,
+        len: usize,
+        table: &AttemptTable,
+    ) -> bool {
         let config = &table.config;
-        let held = table.held.saturating_add(len.max(LETTER_BYTES));
+        let held = table.custody.held().saturating_add(len.max(LETTER_BYTES));
         if self.has_room(len, table) && self.fits_into_custody(len, table) {
             return true;
         }
@@ -353,7 +360,8 @@ impl Lane {
         delivery.position = self.pushed;
         self.pushed += 1;
         let len = delivery.letter.len();
-        table.hold(&self.receiver, self.counted(len));
+        let counted = self.counted(len);
+        table.custody.hold(&self.receiver, counted, &table.config);
         self.bytes += len;
         self.due_at(delivery.deadline);
         if let Some(due) = delivery.custody_due {
@@ -808,7 +816,7 @@ impl Lane {
             return;
         };
         let len = delivery.letter.len();
-        table.release(&self.receiver, self.counted(len));
+        table.custody.release(&self.receiver, self.counted(len));
         self.bytes -= len;
         let is_last = self.letters.is_empty();
         if is_last {

@@ -1,0 +1,282 @@
+//! Parcels that arrive, and the queues of the agents of this process.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa_acl::Letter;
+use fipa_sds::{Entry, Reach, Role};
+use fipa_transport::{
+    Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Parcel, Realm, Report, Stream,
+    Ticket, Verdict,
+};
+
+use super::action::Action;
+use super::inbox::{Inbox, Received, ask};
+use super::lane::LaneKey;
+use super::principals::PrincipalError;
+use super::{Core, News, Now, ReadLetter, reading, work};
+use crate::gate::{LetterParts, Link};
+
+/// A parcel without its body.
+#[derive(Debug)]
+pub(super) struct Label {
+    pub(super) receiver: Arc<str>,
+    pub(super) stream: Stream,
+    pub(super) sequence: u64,
+    pub(super) after: u64,
+    pub(super) transfer: u64,
+    pub(super) remaining: Duration,
+}
+
+impl Label {
+    fn of(parcel: Parcel) -> (Self, Body) {
+        let Parcel {
+            receiver,
+            stream,
+            sequence,
+            after,
+            transfer,
+            remaining,
+            body,
+        } = parcel;
+        let label = Self {
+            receiver,
+            stream,
+            sequence,
+            after,
+            transfer,
+            remaining,
+        };
+        (label, body)
+    }
+}
+
+impl Core {
+    /// Handles a parcel that arrived by this kind of transport.
+    #[inline]
+    pub fn handle_arrival(&mut self, now: Now, via: Kind, arrival: Arrival) -> Verdict {
+        let read = self.reader.read_arrival(&arrival);
+        self.handle_read_arrival(now, via, arrival, read)
+    }
+
+    /// Handles a parcel whose letter the [reader](Self::reader) of this core has
+    /// [read](LetterReader::read_arrival) before the core was locked. A gateway refuses a letter that
+    /// was not read, and so does a core with a gate.
+    pub fn handle_read_arrival(
+        &mut self,
+        now: Now,
+        via: Kind,
+        arrival: Arrival,
+        read: Option<Box<ReadLetter>>,
+    ) -> Verdict {
+        let Arrival {
+            mut parcel,
+            from,
+            ticket,
+        } = arrival;
+        work::steps(1);
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        let view = &*self.table.view;
+        if let Err(error) = self.principals.check_service(&from, is_letter, view) {
+            return Verdict::Now(Answer::failed(FailureReason::Refused, error.to_string()));
+        }
+        if from.is_remote() {
+            parcel.stream.realm = match parcel.body {
+                Body::Letter(_) | Body::Predecessor => self.principals.realm(&from),
+                // About letters of agents of this host.
+                Body::Report(_) | Body::Credit => Realm::UNPROVED,
+            };
+        }
+        let (label, body) = Label::of(parcel);
+        match body {
+            Body::Letter(letter) => {
+                self.handle_letter(now, (via, from, ticket), &label, (letter, read))
+            }
+            Body::Report(report) => self.handle_report(now, &label, &from, report),
+            Body::Credit => self.handle_credit(now, &label, &from),
+            Body::Predecessor => self.handle_predecessor(now, &label, &from),
+        }
+    }
+
+    /// Puts a letter for an agent of this process into its queue, and takes one for another agent into custody.
+    fn handle_letter(
+        &mut self,
+        now: Now,
+        (via, from, ticket): (Kind, Hop, Option<Ticket>),
+        label: &Label,
+        (letter, read): (Letter, Option<Box<ReadLetter>>),
+    ) -> Verdict {
+        if let Err(refusal) = self.check_letter(label, &from, &letter, read.as_deref()) {
+            return Verdict::Now(refusal);
+        }
+        let registration = label.stream.receiver;
+        let Some(inbox) = self.agents.get_mut(&registration) else {
+            let unanswered = ticket.map(|ticket| (via, ticket));
+            let verdict = self.forward(now, (via, from, unanswered), label, letter, read);
+            self.send_failures(now);
+            return verdict;
+        };
+        let seen = self.table.watched.then(|| letter.clone());
+        let parts = read.as_ref().and_then(|read| read.parts.as_ref());
+        let gate = self.reader.gate.as_deref().map(|gate| (gate, parts));
+        let answer = inbox.accept(now.instant, label, letter, (via, &from), gate);
+        if answer == Answer::Accepted {
+            if let Some(letter) = seen {
+                let via = Some(via);
+                self.table
+                    .notice(label.stream, label.sequence, &label.receiver, || {
+                        News::Taken { via, letter }
+                    });
+            }
+            let agent = registration;
+            self.table.actions.push_back(Action::Deliverable { agent });
+        }
+        Verdict::Now(answer)
+    }
+
+    /// Checks what a letter claims: its sender, its place in the stream, and its sizes.
+    ///
+    /// # Errors
+    /// The answer that refuses it.
+    fn check_letter(
+        &mut self,
+        label: &Label,
+        from: &Hop,
+        letter: &Letter,
+        read: Option<&ReadLetter>,
+    ) -> Result<(), Answer> {
+        let refused = |detail: String| Err(Answer::failed(FailureReason::Refused, detail));
+        let sender = (
+            label.stream.sender,
+            read.and_then(|read| read.sender_name()),
+        );
+        let view = &*self.table.view;
+        match self.principals.check_sender(sender, from, view) {
+            Ok(()) => {}
+            Err(PrincipalError::NotIntroduced) => return Err(Answer::Busy),
+            Err(error) => return refused(error.to_string()),
+        }
+        if label.sequence == 0 || label.after >= label.sequence {
+            return refused("the letter's sequence is not above its predecessor's".to_owned());
+        }
+        if self.closed && self.agents.contains_key(&label.stream.receiver) {
+            let reason = FailureReason::NoSuchAgent;
+            return Err(Answer::failed(reason, "the process is closing"));
+        }
+        if let Some(detail) = reading::too_long(letter) {
+            return Err(Answer::failed(FailureReason::TooLarge, detail));
+        }
+        match read.and_then(|read| read.fault.clone()) {
+            Some(detail) => refused(detail),
+            None => Ok(()),
+        }
+    }
+
+    /// Finds the receiver of a letter for an agent of another process.
+    ///
+    /// # Errors
+    /// The answer that refuses the letter: its receiver is unknown, has left this host, or is not for this service to
+    /// pass letters to.
+    pub(super) fn find_receiver(
+        &self,
+        now: Now,
+        label: &Label,
+        from: &Hop,
+    ) -> Result<Arc<Entry>, Answer> {
+        let unknown = |why: &str| Answer::failed(FailureReason::NoSuchAgent, why);
+        let registration = label.stream.receiver;
+        let Some(entry) = self.table.receiver(registration, &label.receiver) else {
+            return Err(
+                match self.table.departed.contains(now.instant, registration) {
+                    true => Answer::Moved,
+                    false => unknown("the agent is not known to the gateway"),
+                },
+            );
+        };
+        if entry.role != Role::Agent {
+            let why = "letters for another gateway are not passed on";
+            return Err(Answer::failed(FailureReason::Refused, why));
+        }
+        // A gateway never relays between other hosts: letters from the network must be for its own.
+        if from.is_remote() && entry.reach != Reach::Local {
+            return Err(unknown("the agent is not on the gateway's host"));
+        }
+        Ok(entry)
+    }
+
+    fn handle_report(&mut self, now: Now, label: &Label, from: &Hop, report: Report) -> Verdict {
+        if let Some(lane) = self.lane_of(label.stream, &label.receiver) {
+            let letter = (label.stream.receiver, label.sequence, label.transfer);
+            self.with_lane(now, lane, |lane, table| {
+                lane.reported(now.instant, from, letter, report, table);
+            });
+        }
+        self.send_failures(now);
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn handle_credit(&mut self, now: Now, label: &Label, from: &Hop) -> Verdict {
+        if let Some(lane) = self.lane_of(label.stream, &label.receiver) {
+            self.with_lane(now, lane, |lane, table| {
+                lane.credited(now.instant, from, table);
+            });
+        }
+        self.send_failures(now);
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn handle_predecessor(&mut self, now: Now, label: &Label, from: &Hop) -> Verdict {
+        let mut answer = None;
+        if let Some(lane) = self.lane_ids.get(&LaneKey::Custody(label.stream)) {
+            let letter = (label.sequence, label.after, label.transfer);
+            self.with_lane(now, *lane, |lane, table| {
+                answer = lane.handle_predecessor_note(now.instant, from, letter, table);
+            });
+        }
+        self.send_failures(now);
+        // A report that is on its way tells more than that the letter is gone.
+        let is_reported = self
+            .table
+            .is_reporting(label.stream, label.sequence, label.transfer);
+        Verdict::Now(match answer {
+            Some(answer) => answer,
+            None if is_reported => {
+                self.table.repeat_reports(now.instant, &from.location);
+                self.await_answers(now);
+                Answer::Accepted
+            }
+            None => Answer::Returned { uncertain: true },
+        })
+    }
+
+    /// Asks the gate, if there is one, about a letter that it has read.
+    pub(super) fn ask_gate(
+        &self,
+        now: Now,
+        receiver: &str,
+        parts: Option<&LetterParts>,
+        link: Link,
+    ) -> Result<(), String> {
+        match &self.reader.gate {
+            Some(gate) => ask(&**gate, now.instant, receiver, parts, link),
+            None => Ok(()),
+        }
+    }
+
+    /// Takes the next letter from an agent's queue.
+    pub fn take(&mut self, agent: Incarnation) -> Option<Received> {
+        let inbox = self.agents.get_mut(&agent)?;
+        let received = inbox.take()?;
+        let receiver = Arc::clone(&inbox.name);
+        for (stream, back) in inbox.credits() {
+            self.table.credit(stream, Arc::clone(&receiver), back);
+        }
+        Some(received)
+    }
+
+    /// Number of letters in an agent's queue.
+    #[must_use]
+    pub fn waiting(&self, agent: Incarnation) -> usize {
+        self.agents.get(&agent).map_or(0, Inbox::len)
+    }
+}

@@ -1,0 +1,374 @@
+//! Letters that agents of this process send: their receivers are looked up, and each copy is put into its lane.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa_acl::Letter;
+use fipa_sds::{Entry, Resolution, Role};
+use fipa_transport::{Attempt, FailureReason, Incarnation, Outcome, Stream};
+
+use super::action::Action;
+use super::failures::{FailureTarget, Undelivered};
+use super::lane::Delivery;
+use super::lanes::own_lane;
+use super::settlement::Origin;
+use super::waiting::Unresolved;
+use super::{Core, MAX_DEADLINE, News, Now, attempts};
+
+/// Identifies a call of [`Core::send`] in its outcomes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct SendId(pub u64);
+
+/// A letter that an agent of this process sends.
+#[derive(Debug, Clone)]
+pub struct Submission {
+    /// The sending agent's incarnation.
+    pub sender: Incarnation,
+    /// The letter, the same for all receivers.
+    pub letter: Letter,
+    /// Names of receivers or coalitions, or patterns.
+    pub receivers: Vec<Arc<str>>,
+    /// Time limit of the delivery, at most [`MAX_DEADLINE`].
+    pub deadline: Duration,
+}
+
+impl Core {
+    /// Sends a letter. Returns the number of outcomes that follow under this ID; outcomes that are
+    /// known at once are among the actions when this method returns. The number is `None` if a
+    /// receiver is not in the view, or is a pattern: [`Action::Resolved`] then reports it after the
+    /// directory was refreshed. Letters of one sender are resolved in the order of the calls.
+    pub fn send(&mut self, now: Now, submission: Submission) -> (SendId, Option<usize>) {
+        let Submission {
+            sender,
+            letter,
+            receivers,
+            deadline,
+        } = submission;
+        let letter = match &receivers[..] {
+            [receiver] => match self.send_to_name(now, sender, letter, receiver, deadline) {
+                Ok(send) => return (send, Some(1)),
+                Err(letter) => letter,
+            },
+            _ => letter,
+        };
+        let send = SendId(self.next_send);
+        self.next_send += 1;
+        if self.closed {
+            for receiver in &receivers {
+                let receiver = Arc::clone(receiver);
+                let reason = FailureReason::Closed;
+                self.undeliverable(send, sender, receiver, letter.clone(), reason);
+            }
+            self.table.undelivered.clear();
+            return (send, Some(receivers.len()));
+        }
+        let deadline = now.instant + deadline.min(MAX_DEADLINE);
+        let mut unresolved = Unresolved {
+            send,
+            sender,
+            letter,
+            receivers,
+            deadline,
+        };
+        if self.is_in_turn(sender) {
+            match self.resolve(now, unresolved, false) {
+                Ok(outcomes) => return (send, Some(outcomes)),
+                Err(back) => unresolved = back,
+            }
+        }
+        let len = unresolved.letter.len();
+        if self.waiting.has_room(sender, len, &self.table.config) {
+            let number = self.table.want_refresh();
+            self.waiting.push(number, unresolved);
+            return (send, None);
+        }
+        let outcomes = unresolved.receivers.len();
+        self.fail_receivers(unresolved, FailureReason::QueueFull);
+        self.send_failures(now);
+        (send, Some(outcomes))
+    }
+
+    /// Sends a letter to the agent with exactly this name. One outcome follows.
+    ///
+    /// # Errors
+    /// Returns the letter if it must be submitted to [`send`](Self::send), for example because the view
+    /// shows no such agent.
+    #[expect(
+        clippy::result_large_err,
+        reason = "the letter is moved in and back; a box would cost an allocation"
+    )]
+    pub fn send_to_name(
+        &mut self,
+        now: Now,
+        sender: Incarnation,
+        letter: Letter,
+        receiver: &str,
+        deadline: Duration,
+    ) -> Result<SendId, Letter> {
+        if self.closed || !self.is_in_turn(sender) {
+            return Err(letter);
+        }
+        let is_agent = |entry: &Arc<Entry>| {
+            entry.incarnation.is_known() && !matches!(entry.role, Role::Coalition(_))
+        };
+        let Some(entry) = self.table.view.named(receiver).filter(is_agent) else {
+            return Err(letter);
+        };
+        let send = SendId(self.next_send);
+        self.next_send += 1;
+        let deadline = now.instant + deadline.min(MAX_DEADLINE);
+        self.send_one(now, (send, sender), &entry, letter, deadline);
+        self.send_failures(now);
+        Ok(send)
+    }
+
+    /// Whether no earlier letter of this sender waits to be resolved.
+    pub(super) fn is_in_turn(&self, sender: Incarnation) -> bool {
+        self.waiting.is_empty() || !self.waiting.has_any_of(sender)
+    }
+
+    /// Resolves the receivers of a letter in the view, and sends it to them. Returns the number of
+    /// outcomes, or the letter if a refresh of the directory may add receivers. After a refresh, an
+    /// unknown receiver is final.
+    #[expect(
+        clippy::result_large_err,
+        reason = "the letter is moved in and back; a box would cost an allocation"
+    )]
+    pub(super) fn resolve(
+        &mut self,
+        now: Now,
+        unresolved: Unresolved,
+        is_fresh: bool,
+    ) -> Result<usize, Unresolved> {
+        let view = Arc::clone(&self.table.view);
+        let sender = unresolved.sender;
+        let sender_name = self
+            .agents
+            .get(&sender)
+            .map(|inbox| Arc::clone(&inbox.name));
+        let own = sender_name.as_deref().unwrap_or_default();
+        let mut resolved = Vec::new();
+        for receiver in &unresolved.receivers {
+            let resolution = fipa_sds::resolve(&*view, receiver, own);
+            match resolution {
+                Ok(resolution) if !is_fresh && !resolution.is_complete() => {
+                    return Err(unresolved);
+                }
+                Ok(resolution) => resolved.push(resolution),
+                // Not a valid pattern, so no name matches it.
+                Err(_) => resolved.push(Resolution::None),
+            }
+        }
+        let Unresolved {
+            send,
+            letter,
+            receivers,
+            deadline,
+            ..
+        } = unresolved;
+        let mut reached: Vec<Incarnation> = Vec::new();
+        let mut count = 0;
+        for (receiver, resolution) in receivers.into_iter().zip(resolved) {
+            let entries = match resolution {
+                Resolution::Exact(entry) => vec![entry],
+                Resolution::Multicast(entries) => entries,
+                Resolution::Coalition { agents, missing } => {
+                    count += missing.len();
+                    for member in missing {
+                        self.absent(send, sender, member, letter.clone());
+                    }
+                    if agents.is_empty() {
+                        continue;
+                    }
+                    agents
+                }
+                Resolution::None => Vec::new(),
+            };
+            if entries.is_empty() {
+                count += 1;
+                self.absent(send, sender, receiver, letter.clone());
+            }
+            for entry in entries {
+                let registration = attempts::registration_of(&entry);
+                if reached.contains(&registration) {
+                    continue;
+                }
+                reached.push(registration);
+                count += 1;
+                self.send_one(now, (send, sender), &entry, letter.clone(), deadline);
+            }
+        }
+        self.send_failures(now);
+        Ok(count)
+    }
+
+    /// Ends a letter whose receivers were not resolved.
+    pub(super) fn fail_unresolved(&mut self, letter: Unresolved, reason: FailureReason) {
+        self.table.actions.push_back(Action::Resolved {
+            send: letter.send,
+            outcomes: letter.receivers.len(),
+        });
+        self.fail_receivers(letter, reason);
+    }
+
+    pub(super) fn fail_receivers(&mut self, letter: Unresolved, reason: FailureReason) {
+        let Unresolved {
+            send,
+            sender,
+            letter,
+            receivers,
+            ..
+        } = letter;
+        for receiver in receivers {
+            self.undeliverable(send, sender, receiver, letter.clone(), reason);
+        }
+    }
+
+    /// Handles the end of a refresh of the directory, which began after the core had emitted
+    /// [`Action::Refresh`] with this number. Call [`set_view`](Self::set_view) before. A refresh
+    /// covers all earlier numbers, too.
+    pub fn handle_refreshed(&mut self, now: Now, number: u64) {
+        while let Some(lane) = self.table.refreshed_lane(number) {
+            self.with_lane(now, lane, |lane, table| {
+                lane.refreshed(now.instant, number, table);
+            });
+        }
+        while let Some(letter) = self.waiting.pop(number) {
+            let send = letter.send;
+            if let Ok(outcomes) = self.resolve(now, letter, true) {
+                let resolved = Action::Resolved { send, outcomes };
+                self.table.actions.push_back(resolved);
+            }
+        }
+        self.send_failures(now);
+    }
+
+    /// Sends a letter to exactly this registration of an agent; the receivers in the submission are
+    /// ignored. One outcome follows under this ID.
+    pub fn send_to(&mut self, now: Now, submission: Submission, entry: &Entry) -> SendId {
+        let send = SendId(self.next_send);
+        self.next_send += 1;
+        let deadline = now.instant + submission.deadline.min(MAX_DEADLINE);
+        let sending = (send, submission.sender);
+        self.send_one(now, sending, entry, submission.letter, deadline);
+        self.send_failures(now);
+        send
+    }
+
+    pub(super) fn send_one(
+        &mut self,
+        now: Now,
+        (send, sender): (SendId, Incarnation),
+        entry: &Entry,
+        letter: Letter,
+        deadline: Instant,
+    ) {
+        let stream = Stream::between(sender, attempts::registration_of(entry));
+        let name = &entry.name;
+        if self.closed {
+            let reason = FailureReason::Closed;
+            return self.undeliverable(send, sender, Arc::clone(name), letter, reason);
+        }
+        let lane = self.lane(now, own_lane(sender, entry), name);
+        if !self.holds_back(now, lane, letter.len()) {
+            let reason = FailureReason::QueueFull;
+            return self.undeliverable(send, sender, Arc::clone(name), letter, reason);
+        }
+        let sequence = self.sequence_of(sender);
+        self.table.notice(stream, sequence, name, || News::Sent {
+            send: Some(send),
+            letter: letter.clone(),
+        });
+        let origin = Origin::Local { send };
+        let letter_of = (stream.receiver, sequence);
+        let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
+        self.put(now, lane, delivery);
+    }
+
+    /// Fails a letter for an agent that cannot be reached at any of its addresses. `attempts` has the reason for
+    /// each of them. One outcome follows.
+    pub fn fail_unreachable(
+        &mut self,
+        now: Now,
+        (sender, letter): (Incarnation, Letter),
+        receiver: Arc<str>,
+        attempts: Vec<Attempt>,
+    ) -> SendId {
+        let send = SendId(self.next_send);
+        self.next_send += 1;
+        let reason = FailureReason::NoSuchAgent;
+        self.failed(send, sender, receiver, letter, (reason, attempts));
+        self.send_failures(now);
+        send
+    }
+
+    /// Fails a letter to an agent that the directory does not list.
+    pub(super) fn absent(
+        &mut self,
+        send: SendId,
+        sender: Incarnation,
+        receiver: Arc<str>,
+        letter: Letter,
+    ) {
+        let (reason, attempt) = self.table.absence(&receiver);
+        let why = (reason, attempt.into_iter().collect());
+        self.failed(send, sender, receiver, letter, why);
+    }
+
+    pub(super) fn failed(
+        &mut self,
+        send: SendId,
+        sender: Incarnation,
+        receiver: Arc<str>,
+        letter: Letter,
+        (reason, attempts): (FailureReason, Vec<Attempt>),
+    ) {
+        let details: Vec<String> = attempts.iter().map(ToString::to_string).collect();
+        let detail = details.join("; ");
+        let outcome = Outcome::Failed { reason, attempts };
+        let sequence = self.sequence_of(sender);
+        let stream = Stream::between(sender, Incarnation::UNKNOWN);
+        self.table
+            .notice(stream, sequence, &receiver, || News::Sent {
+                send: Some(send),
+                letter: letter.clone(),
+            });
+        self.table
+            .notice(stream, sequence, &receiver, || News::Settled {
+                outcome: outcome.clone(),
+                sender: true,
+            });
+        self.table.undelivered.push_back(Undelivered {
+            sender: FailureTarget::Ours(sender),
+            receiver: Arc::clone(&receiver),
+            letter,
+            reason,
+            detail,
+        });
+        self.table.actions.push_back(Action::Outcome {
+            send,
+            receiver,
+            outcome,
+        });
+    }
+
+    pub(super) fn undeliverable(
+        &mut self,
+        send: SendId,
+        sender: Incarnation,
+        receiver: Arc<str>,
+        letter: Letter,
+        reason: FailureReason,
+    ) {
+        self.failed(send, sender, receiver, letter, (reason, Vec::new()));
+    }
+
+    pub(super) fn sequence_of(&mut self, sender: Incarnation) -> u64 {
+        let counter = match self.agents.get_mut(&sender) {
+            Some(inbox) => &mut inbox.next_sequence,
+            None => &mut self.next_sequence,
+        };
+        *counter += 1;
+        *counter - 1
+    }
+}

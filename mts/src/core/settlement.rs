@@ -1,0 +1,160 @@
+//! The end of a letter in a lane, and who is told.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use fipa_transport::{
+    Answer, Body, Kind, LegacySource, Location, Outcome, Parcel, Report, Stream, Ticket,
+};
+use smallvec::SmallVec;
+
+use super::action::Action;
+use super::attempts::{AttemptTable, note_parcel};
+use super::lane::Delivery;
+use super::notes::Note;
+use super::{News, SendId};
+use crate::failure::Failed;
+
+/// Origin of a delivery, which determines the receiver of its outcome.
+#[derive(Debug)]
+pub(crate) enum Origin {
+    /// An agent of this process, which gets an outcome.
+    Local { send: SendId },
+    /// Other message transport services, which get a late answer or a report.
+    Forwarded { upstreams: SmallVec<[Upstream; 1]> },
+    /// The source at a legacy peer, which gets this in a failure message, if anything.
+    LegacyPeer {
+        from: LegacySource,
+        failed: Option<Arc<Failed>>,
+    },
+    /// A failure message; its outcome is not reported.
+    FailureMessage,
+}
+
+/// A service that handed over a copy of a letter.
+#[derive(Debug)]
+pub(crate) struct Upstream {
+    /// Location for reports to it.
+    pub(crate) back: Location,
+    /// Whether it is on another host.
+    pub(crate) remote: bool,
+    /// The attempt number of its latest hand-over of the letter, which a report names.
+    pub(crate) transfer: u64,
+    /// Its arrival that has no answer yet.
+    pub(crate) unanswered: Option<(Kind, Ticket)>,
+}
+
+/// The way in which a letter leaves a lane.
+#[derive(Debug)]
+pub(crate) enum Settlement {
+    /// It has an outcome.
+    Outcome(Outcome),
+    /// A custodian returns it, because its predecessor did not arrive, or the custodian ends.
+    Returned { uncertain: bool },
+    /// A custodian returns it, because the receiver's registration has left this host.
+    Moved,
+}
+
+impl AttemptTable {
+    /// Reports the end of a letter to its sender, or to the services that handed it over.
+    pub(crate) fn settle(
+        &mut self,
+        delivery: Box<Delivery>,
+        stream: Stream,
+        receiver: Arc<str>,
+        settlement: Settlement,
+    ) {
+        let Delivery {
+            origin,
+            sequence,
+            deadline,
+            ..
+        } = *delivery;
+        if let Settlement::Outcome(outcome) = &settlement {
+            self.notice(stream, sequence, &receiver, || News::Settled {
+                outcome: outcome.clone(),
+                sender: !matches!(origin, Origin::Forwarded { .. }),
+            });
+        }
+        match (origin, settlement) {
+            (Origin::Local { send }, Settlement::Outcome(outcome)) => {
+                self.actions.push_back(Action::Outcome {
+                    send,
+                    receiver,
+                    outcome,
+                });
+            }
+            (Origin::Forwarded { upstreams }, settlement) => {
+                let (brief, report) = answer_and_report(settlement);
+                for upstream in upstreams {
+                    let letter = (stream, sequence);
+                    self.report_to(upstream, letter, &receiver, (&brief, &report), deadline);
+                }
+            }
+            // Only custodians return letters; a failed failure message is not reported.
+            (Origin::Local { .. } | Origin::LegacyPeer { .. } | Origin::FailureMessage, _) => {}
+        }
+    }
+
+    fn report_to(
+        &mut self,
+        upstream: Upstream,
+        (stream, sequence): (Stream, u64),
+        receiver: &Arc<str>,
+        (brief, report): (&Option<Answer>, &Report),
+        deadline: Instant,
+    ) {
+        let Upstream {
+            back,
+            remote,
+            transfer,
+            unanswered,
+        } = upstream;
+        if let Some((kind, ticket)) = unanswered {
+            let answer = match brief {
+                // The transport within another host is of no interest there.
+                Some(Answer::Delivered { .. }) if remote => Answer::Accepted,
+                Some(brief) => brief.clone(),
+                None => Answer::Custody,
+            };
+            self.actions.push_back(Action::Answer {
+                kind,
+                ticket,
+                answer,
+            });
+            if brief.is_some() {
+                return;
+            }
+        }
+        let body = Body::Report(report.clone());
+        let parcel = Parcel {
+            transfer,
+            ..note_parcel(stream, Arc::clone(receiver), sequence, body)
+        };
+        self.note(Note::until(deadline, back, parcel));
+    }
+}
+
+/// The answer to services that handed a letter over, if an answer can express the end, and the
+/// report otherwise.
+fn answer_and_report(settlement: Settlement) -> (Option<Answer>, Report) {
+    match settlement {
+        Settlement::Outcome(outcome) => {
+            let brief = match &outcome {
+                Outcome::Delivered { via, attempts } if attempts.is_empty() => {
+                    Some(Answer::Delivered { via: *via })
+                }
+                Outcome::Failed { reason, attempts } if attempts.is_empty() => {
+                    Some(Answer::failed(*reason, ""))
+                }
+                _ => None,
+            };
+            (brief, Report::Settled(outcome))
+        }
+        Settlement::Returned { uncertain } => (
+            Some(Answer::Returned { uncertain }),
+            Report::Returned { uncertain },
+        ),
+        Settlement::Moved => (Some(Answer::Moved), Report::Moved),
+    }
+}
