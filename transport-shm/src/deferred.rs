@@ -7,7 +7,7 @@ use fipa_transport::{Answer, Incarnation, Ticket};
 use parking_lot::Mutex;
 
 use crate::answer_words::WordPlace;
-use crate::inbox::{BorrowLimits, RequestOwner};
+use crate::borrowed::{BorrowLimits, RequestOwner};
 use crate::layout::{Ack, UninitAck, code_of};
 use crate::presence::StatusPage;
 

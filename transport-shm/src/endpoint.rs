@@ -27,12 +27,14 @@ use crate::fork::Owner;
 use crate::inbox::{Inbox, mailbox_name};
 use crate::layout::Svc;
 use crate::loan::ShmLoan;
-use crate::memory::{Budget, SHM};
+use crate::memory::Budget;
+use crate::outbox::Concluded;
 use crate::outbox::{AnswerLook, MemoryLock, Opening, Outbox};
 use crate::peer_segments::PeerSegments;
-use crate::peers::{BacklogLimits, BacklogStep, Concluded, Dispatched, OpenOutbox, Peer};
+use crate::peers::{BacklogLimits, BacklogStep, Dispatched, OpenOutbox, Peer};
 use crate::pool::Pool;
 use crate::presence::{Doorbell, POLL_GRACE, PeerProcess, Presence, WordLender, wait_for_polls};
+use crate::shared_files::SHM;
 use crate::storage::{self, Shortage};
 use crate::{ShmConfig, ShmError};
 

@@ -17,12 +17,15 @@ use parking_lot::Mutex;
 use crate::ShmConfig;
 use crate::answer_words::WordPlace;
 use crate::answered::Answered;
+use crate::borrowed::{
+    BorrowLimits, BorrowedContent, BorrowedSegmentContent, HeldRequest, RequestOwner,
+};
 use crate::counters::{Tally, count, count_alone};
 use crate::deferred::{AnswerWay, LateAnswers, UnansweredParcel};
-use crate::layout::{Ack, Active, Header, MailServer, PieceOffsets, Svc, UninitAck};
+use crate::layout::{ANSWERS, Ack, Active, Header, MailServer, PieceOffsets, Svc, UninitAck};
 use crate::memory::MappedPtr;
-use crate::peer_segments::{PeerSegments, ReadError, SegmentContent};
-use crate::presence::{Doorbell, Presence, StatusPage};
+use crate::peer_segments::{PeerSegments, ReadError};
+use crate::presence::{Presence, StatusPage};
 use crate::segment::ContentReference;
 use crate::storage;
 use crate::wakeup::Account;
@@ -30,14 +33,7 @@ use crate::wakeup::Account;
 /// Maximum number of parcels that are taken before other work gets a turn.
 const BATCH: usize = 64;
 
-/// Maximum number of answers under way to all senders together.
-const ANSWERS: usize = 1024;
-
 const _: () = assert!(ANSWERS <= storage::MAX_CHUNKS);
-
-/// Maximum number of late answers to all senders together. The others remain for parcels that are
-/// answered at once.
-const MAX_LATE_ANSWERS: usize = ANSWERS / 2;
 
 /// Name of a mailbox of a process. Each mailbox has a name of its own: with the last reference to a
 /// mailbox, iceoryx2 removes the files of its name, and peers and content may hold a reference
@@ -461,199 +457,4 @@ impl Inbox {
 
 fn debug(error: impl std::fmt::Debug) -> String {
     crate::errors::words(&error)
-}
-
-/// The owner of a request: this value alone, or the handed-out content.
-pub(crate) enum RequestOwner {
-    Unshared(Active),
-    /// The content owns the request, too.
-    Content(Arc<HeldRequest>),
-}
-
-impl RequestOwner {
-    /// Loans memory for a response.
-    fn loan_response(&self) -> Option<UninitAck> {
-        match self {
-            Self::Unshared(active) => active.loan_uninit().ok(),
-            Self::Content(request) => request.active.lock().as_ref()?.loan_uninit().ok(),
-        }
-    }
-}
-
-/// A request whose content is read in place, and whose slot is counted as held by its sender.
-pub(crate) struct HeldRequest {
-    /// `Some` until this is dropped.
-    active: Mutex<Option<Active>>,
-    sender: u128,
-    borrows: Arc<BorrowLimits>,
-}
-
-impl HeldRequest {
-    pub(crate) fn sender(&self) -> u128 {
-        self.sender
-    }
-}
-
-impl Drop for HeldRequest {
-    fn drop(&mut self) {
-        let active = self.active.get_mut().take();
-        if !self.borrows.peer_segments.owner().is_this() {
-            // In a forked child, a release would take the memory from the parent.
-            std::mem::forget(active);
-            return;
-        }
-        // The memory first, then the count: a slot that counts as free must be free.
-        drop(active);
-        self.borrows.end(self.sender);
-    }
-}
-
-/// Content in the payload of a sender's request, which is read in place.
-struct BorrowedContent {
-    bytes: MappedPtr<[u8]>,
-    _request: Arc<HeldRequest>,
-}
-
-impl AsRef<[u8]> for BorrowedContent {
-    fn as_ref(&self) -> &[u8] {
-        // SAFETY: the range is in the payload of the held request, which stays mapped as long
-        // as that exists: the server keeps the connection of an ended sender while content is held
-        // there, and `BorrowLimits::begin` bounds the number of such connections below the number
-        // that it keeps. An honest sender does not write there after sending; see the crate's
-        // section on trust.
-        unsafe { self.bytes.0.as_ref() }
-    }
-}
-
-/// Content in a sender's segment, counted as held.
-struct BorrowedSegmentContent {
-    content: SegmentContent,
-    borrows: Arc<BorrowLimits>,
-}
-
-impl AsRef<[u8]> for BorrowedSegmentContent {
-    fn as_ref(&self) -> &[u8] {
-        self.content.as_ref()
-    }
-}
-
-impl Drop for BorrowedSegmentContent {
-    fn drop(&mut self) {
-        let _held = self.borrows.held.lock();
-        self.borrows.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
-    }
-}
-
-/// Limits on the content that is held in place, and on late answers.
-pub(crate) struct BorrowLimits {
-    per_sender: usize,
-    /// Number of held slots of a sender at which its parcels are answered at once.
-    late_per_sender: usize,
-    total: usize,
-    held: Mutex<HeldSlots>,
-    /// Whether the mailbox cannot be drained until content is released.
-    waiting: AtomicBool,
-    doorbell: Arc<Doorbell>,
-    tally: Arc<Tally>,
-    // Last: the last owner of content removes the domain's files, which the segments' owner does.
-    peer_segments: Arc<PeerSegments>,
-}
-
-/// The slots of senders that are held.
-#[derive(Default)]
-struct HeldSlots {
-    /// Number of held slots of each sender. The list is short enough for a linear search.
-    of: Vec<(u128, usize)>,
-    /// Number of late answers to all senders.
-    late: usize,
-}
-
-impl HeldSlots {
-    fn count(&self, sender: u128) -> usize {
-        let mut of = self.of.iter();
-        of.find(|(one, _)| *one == sender)
-            .map_or(0, |(_, count)| *count)
-    }
-
-    /// Counts one more slot of this sender, up to `most`.
-    fn begin(&mut self, sender: u128, most: usize) -> bool {
-        match self.of.iter().position(|(one, _)| *one == sender) {
-            Some(place) if self.of[place].1 < most => self.of[place].1 += 1,
-            None if self.of.len() < ShmConfig::MAX_LENDERS => self.of.push((sender, 1)),
-            _ => return false,
-        }
-        true
-    }
-
-    fn end(&mut self, sender: u128) {
-        if let Some(place) = self.of.iter().position(|(one, _)| *one == sender) {
-            self.of[place].1 -= 1;
-            if self.of[place].1 == 0 {
-                self.of.swap_remove(place);
-            }
-        }
-    }
-}
-
-impl BorrowLimits {
-    /// Counts one more content in a segment, which takes no slot of its sender. False at the limit.
-    fn begin_segment(&self) -> bool {
-        let _held = self.held.lock();
-        let few = self.tally.borrowed.load(Ordering::Relaxed) < self.total as u64;
-        if few {
-            self.tally.borrowed.fetch_add(1, Ordering::Relaxed);
-        }
-        few
-    }
-
-    /// Counts one more content of this sender, if a slot stays free for its next letter.
-    fn begin(&self, sender: u128) -> bool {
-        let mut held = self.held.lock();
-        // Changed only under the lock.
-        if self.tally.borrowed.load(Ordering::Relaxed) >= self.total as u64 {
-            return false;
-        }
-        let begun = held.begin(sender, self.per_sender);
-        if begun {
-            self.tally.borrowed.fetch_add(1, Ordering::Relaxed);
-        }
-        begun
-    }
-
-    /// Counts one more late answer to this sender, if fewer than half of its slots are held without
-    /// it. `counted` is whether the slot is held by content already.
-    pub(crate) fn begin_late_answer(&self, sender: u128, counted: bool) -> bool {
-        let mut held = self.held.lock();
-        let others = held.count(sender) - usize::from(counted);
-        let begun = held.late < MAX_LATE_ANSWERS
-            && others < self.late_per_sender
-            && (counted || held.begin(sender, self.late_per_sender));
-        held.late += usize::from(begun);
-        begun
-    }
-
-    pub(crate) fn end_late_answer(&self, sender: u128, counted: bool) {
-        let mut held = self.held.lock();
-        held.late -= 1;
-        if !counted {
-            held.end(sender);
-        }
-        drop(held);
-        self.drain_again();
-    }
-
-    fn end(&self, sender: u128) {
-        let mut held = self.held.lock();
-        held.end(sender);
-        self.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
-        drop(held);
-        self.drain_again();
-    }
-
-    /// Rings the doorbell if the mailbox waits for a slot.
-    fn drain_again(&self) {
-        if self.waiting.swap(false, Ordering::SeqCst) {
-            self.doorbell.ring();
-        }
-    }
 }

@@ -4,7 +4,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use crate::domain_files::{DomainFiles, file_error};
-use crate::memory::{Budget, SHM};
+use crate::memory::Budget;
+use crate::shared_files::SHM;
 use crate::shared_files::shared_files;
 use crate::{ShmConfig, ShmError};
 

@@ -16,7 +16,6 @@ use iceoryx2::response_mut_uninit::ResponseMutUninit;
 use zerocopy::{FromBytes, IntoBytes};
 
 use crate::answer_words::WordPlace;
-use crate::presence::AnswerPlace;
 use crate::segment::ContentReference;
 pub(crate) use crate::variant::Svc;
 
@@ -31,6 +30,9 @@ pub(crate) type UninitAck = ResponseMutUninit<Svc, MaybeUninit<Ack>, ()>;
 
 /// Alignment of contents in bytes.
 pub(crate) const ALIGNMENT: usize = 8;
+
+/// Maximum number of answers under way to all senders together.
+pub(crate) const ANSWERS: usize = 1024;
 
 /// Version of this layout and of the status page. iceoryx2 refuses other versions, because their
 /// types have other names.
@@ -77,21 +79,21 @@ impl Default for Header {
 }
 
 impl Header {
-    /// Creates a header for content in the payload. The answer repeats the token of `answer`.
+    /// Creates a header for content in the payload. The answer repeats the token, and may go into the word.
     pub(crate) fn new(
         parcel: &ParcelHeader,
         start: u32,
         sender: Incarnation,
-        answer: &AnswerPlace,
+        token: u64,
+        WordPlace { page, word }: WordPlace,
     ) -> Self {
-        let WordPlace { page, word } = answer.word();
         let mut bytes = [0; HEADER_LEN];
         bytes.copy_from_slice(parcel.as_bytes());
         Self {
             version: VERSION,
             start,
             sender: sender.as_u64(),
-            token: answer.token(),
+            token,
             page,
             word,
             reserved: 0,

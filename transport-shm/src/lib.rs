@@ -14,6 +14,8 @@
 //! |---|---|
 //! | `endpoint` | the endpoint: mailbox, peers, polling, cleanup |
 //! | `inbox`, `outbox` | receiving and sending side of a mailbox |
+//! | `content` | writes a parcel, whose content is copied, loaned, or in a segment |
+//! | `borrowed` | content that is read in place, and the slots that it holds |
 //! | `layout` | types and byte layout in shared memory |
 //! | `answer_words`, `deferred` | answers in words; parcels that are answered later |
 //! | `loan` | memory that is handed out before its letter is sent |
@@ -43,8 +45,10 @@ mod answer_words;
 #[cfg(test)]
 mod answer_words_tests;
 mod answered;
+mod borrowed;
 mod combiner;
 mod config;
+mod content;
 mod counters;
 mod deferred;
 mod domain_files;
@@ -60,6 +64,7 @@ mod layout;
 mod loan;
 mod memory;
 mod outbox;
+mod paths;
 mod peer_segments;
 mod peers;
 mod pool;

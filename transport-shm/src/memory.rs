@@ -17,13 +17,10 @@ use rustix::io::Errno;
 use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
 use rustix::param::page_size;
 
-use crate::presence::ProcessPaths;
-use crate::shared_files::shared_files;
+use crate::paths::ProcessPaths;
+use crate::shared_files::{SHM, shared_files};
 use crate::storage::{self, Shortage};
 use crate::{ShmConfig, ShmError};
-
-/// Mount point of POSIX shared memory on Linux.
-pub(crate) const SHM: &str = "/dev/shm";
 
 /// Free bytes that are left for other programs and small files.
 const MARGIN: u64 = 256 << 10;

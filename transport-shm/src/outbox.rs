@@ -1,7 +1,6 @@
 //! The sending side of another process's mailbox.
 
 use std::collections::VecDeque;
-use std::ops::Range;
 use std::os::fd::OwnedFd;
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering, fence};
@@ -16,7 +15,9 @@ use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::DegradationAction;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, PortFactory, ServiceName};
 use parking_lot::{Mutex, MutexGuard};
+use smallvec::SmallVec;
 
+use crate::content::{ContentWrite, write};
 use crate::counters::{Tally, count, count_alone};
 use crate::domain_files::DomainFiles;
 use crate::errors::{
@@ -30,7 +31,6 @@ use crate::layout::{
 };
 use crate::loan::{Loan, ShmLoan};
 use crate::memory::{Budget, populate, shortage_error};
-use crate::peers::Concluded;
 use crate::pool::Pool;
 use crate::presence::{AnswerPlace, StatusPage, WordLender};
 use crate::storage;
@@ -45,6 +45,9 @@ const SHORT: usize = FIRST_CHUNK - header_len();
 const OPENING: u64 = 1 << 20;
 
 static NO_CONTENT: Bytes = Bytes::new();
+
+/// Attempts that have ended. Most polls end few.
+pub(crate) type Concluded = SmallVec<[(AttemptId, Conclusion); 4]>;
 
 /// A client of another process's mailbox, and the parcels sent there that are unanswered.
 ///
@@ -326,7 +329,13 @@ impl Outbox {
             {
                 Some(request) => {
                     let start = loan.front() - front;
-                    let header = Header::new(&header, offset(start)?, self.own, &answer);
+                    let header = Header::new(
+                        &header,
+                        offset(start)?,
+                        self.own,
+                        answer.token(),
+                        answer.word(),
+                    );
                     if !self.send_loan(&loan, request, header, start, &pieces, content)? {
                         return Ok(Posted::Retired);
                     }
@@ -350,7 +359,13 @@ impl Outbox {
                 None => return Ok(Posted::Contended),
             },
         };
-        let header = Header::new(&header, offset(offsets.start)?, self.own, &answer);
+        let header = Header::new(
+            &header,
+            offset(offsets.start)?,
+            self.own,
+            answer.token(),
+            answer.word(),
+        );
         *request.user_header_mut() = header.referring(reference);
         let payload = request.payload_mut();
         let room = offsets.start..payload.len();
@@ -840,52 +855,6 @@ impl Sent {
         if let SentMemory::Loaned(loan) = &self.memory {
             loan.queued.store(false, Ordering::Relaxed);
         }
-    }
-}
-
-/// The treatment of the content when a parcel is written.
-enum ContentWrite<'a> {
-    /// Written like the other pieces.
-    Here,
-    /// Already in its place: skipped, but its room is counted.
-    InPlace(&'a Bytes),
-    /// In a segment: skipped.
-    Elsewhere(&'a Bytes),
-}
-
-/// Writes pieces one after the other into `room`, a range of offsets from `start` in bytes.
-///
-/// # Panics
-/// Panics if the pieces are longer than the room. The lengths come from other crates, and only this
-/// check compares them with what is written.
-///
-/// # Safety
-/// The room must be in memory that may be written, and nothing else may refer to the parts of it
-/// that are written.
-unsafe fn write(
-    start: NonNull<u8>,
-    room: Range<usize>,
-    pieces: &Pieces<'_>,
-    content: ContentWrite<'_>,
-) {
-    let Range { start: mut at, end } = room;
-    for piece in pieces.iter() {
-        let place = start.as_ptr().wrapping_add(at);
-        let is = |content: &Bytes| std::ptr::eq(&content[..], piece);
-        let is_written = match content {
-            ContentWrite::Elsewhere(content) if is(content) => continue,
-            ContentWrite::InPlace(content) => !is(content),
-            ContentWrite::Here | ContentWrite::Elsewhere(_) => true,
-        };
-        let most = end.saturating_sub(at);
-        assert!(piece.len() <= most, "pieces have the lengths of the header");
-        if is_written {
-            // SAFETY: the assertion above shows that the piece fits behind `place`, in memory that
-            // may be written according to the caller. The piece does not overlap it, because
-            // nothing else refers to that memory.
-            unsafe { place.copy_from_nonoverlapping(piece.as_ptr(), piece.len()) };
-        }
-        at += piece.len();
     }
 }
 

@@ -9,16 +9,12 @@ use fipa_transport::{
     Abandoned, AttemptId, Body, Conclusion, Incarnation, Parcel, TransportError, TransportErrorKind,
 };
 use parking_lot::Mutex;
-use smallvec::SmallVec;
 use tokio::runtime::Handle;
 use tokio::task::AbortHandle;
 
 use crate::errors::{closed, opening, retired};
-use crate::outbox::{AnswerLook, MemoryLock, Outbox, Posted};
+use crate::outbox::{AnswerLook, Concluded, MemoryLock, Outbox, Posted};
 use crate::presence::{PeerProcess, SharedFd, StatusPage, has_ended};
-
-/// Attempts that have ended. Most polls end few.
-pub(crate) type Concluded = SmallVec<[(AttemptId, Conclusion); 4]>;
 
 /// A value that the count of polls does not reach.
 const NEVER: u64 = u64::MAX;

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use fipa_transport::log_limit;
 
-use crate::memory::SHM;
+/// Mount point of POSIX shared memory on Linux.
+pub(crate) const SHM: &str = "/dev/shm";
 
 /// Maximum number of files that are examined, because a user of the host may create millions. Files that are not
 /// found are removed by a later cleanup.

@@ -614,7 +614,7 @@ mod tests {
     fn a_file_larger_than_the_file_system_is_a_reported_error() {
         let name = format!("fipatest-{}", Incarnation::random());
         let name = FileName::try_from(name.as_str()).unwrap();
-        let found = rustix::fs::statvfs(crate::memory::SHM).unwrap();
+        let found = rustix::fs::statvfs(crate::shared_files::SHM).unwrap();
         let total = found.f_blocks * found.f_frsize;
         assert!(total > 0, "a file system without a limit cannot be full");
         // More than the file system has, which the kernel refuses before it allocates anything.
