@@ -7,7 +7,9 @@
 )]
 
 #[cfg(feature = "http")]
-pub use crate::http::fuzzing as http;
+pub use crate::legacy::http::fuzzing as http;
+#[cfg(feature = "udt")]
+pub use crate::legacy::udt::fuzzing::{UdtPacket, UdtPackets};
 #[cfg(feature = "quic")]
 pub use crate::quic::fuzzing::QuicStreams;
 #[cfg(feature = "secure")]
@@ -15,5 +17,3 @@ pub use crate::secure::certified;
 pub use crate::stream::fuzzing::{Framed, answer_body, frame, hello_body, parcel_body};
 #[cfg(feature = "ip")]
 pub use crate::udp::fuzzing::{Datagrams, Written};
-#[cfg(feature = "udt")]
-pub use crate::udt::fuzzing::{UdtPacket, UdtPackets};

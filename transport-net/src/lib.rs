@@ -30,8 +30,6 @@ mod end;
 #[doc(hidden)]
 pub mod fuzzing;
 mod hello;
-#[cfg(feature = "http")]
-mod http;
 mod identity;
 #[cfg(feature = "ip")]
 mod interfaces;
@@ -56,15 +54,15 @@ mod stream;
 mod tcp;
 #[cfg(feature = "ip")]
 mod udp;
-#[cfg(feature = "udt")]
-mod udt;
 mod unix;
 
 #[cfg(feature = "ip")]
 pub use address::{AddressError, look_up, reachable_at, resolve};
-#[cfg(feature = "http")]
-pub use http::{HttpConfig, HttpTransport};
 pub use identity::Identity;
+#[cfg(feature = "http")]
+pub use legacy::http::{HttpConfig, HttpTransport};
+#[cfg(feature = "udt")]
+pub use legacy::udt::{UdtConfig, UdtCounters, UdtLimits, UdtTransport};
 #[cfg(feature = "quic")]
 pub use quic::{QuicConfig, QuicTransport};
 #[cfg(feature = "ip")]
@@ -76,6 +74,4 @@ pub use stream::counters::Counters;
 pub use tcp::{TcpConfig, TcpTransport};
 #[cfg(feature = "ip")]
 pub use udp::{UdpConfig, UdpCounters, UdpLimits, UdpTransport};
-#[cfg(feature = "udt")]
-pub use udt::{UdtConfig, UdtCounters, UdtLimits, UdtTransport};
 pub use unix::{UnixConfig, UnixError, UnixTransport};

@@ -6,7 +6,7 @@
 //! * [`cookie`]: the address validation of unproved peers. [`dialing`]: the handshake of the
 //!   dialing side.
 //!
-//! The protocols themselves are in [`crate::udp`] and `crate::udt`.
+//! The protocols themselves are in [`crate::udp`] and `crate::legacy::udt`.
 
 pub(crate) mod connections;
 pub(crate) mod cookie;

@@ -247,5 +247,4 @@ fn parcel_header(body: &mut Bytes) -> Result<ParcelHeader, WireError> {
 }
 
 #[cfg(test)]
-#[path = "frame_tests.rs"]
 mod tests;

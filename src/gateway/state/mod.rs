@@ -621,7 +621,7 @@ pub(crate) fn play(bytes: &[u8]) {
 mod tests {
     use super::*;
 
-    const FILE: &str = include_str!("state/example.txt");
+    const FILE: &str = include_str!("../state/example.txt");
 
     fn head(items: usize) -> Head {
         Head {

@@ -5,7 +5,7 @@ use bytes::Bytes;
 use super::request::RequestReader;
 use super::response::ResponseReader;
 use super::{letter, multipart, request};
-use crate::http::url::Url;
+use crate::legacy::http::url::Url;
 
 /// Maximum length of a body.
 const MAX_BODY: usize = 4096;

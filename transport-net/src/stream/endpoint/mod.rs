@@ -1217,5 +1217,4 @@ impl Drop for UnprovedSlot {
 }
 
 #[cfg(all(test, feature = "ip"))]
-#[path = "endpoint_tests.rs"]
 mod tests;

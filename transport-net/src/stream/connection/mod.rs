@@ -925,5 +925,4 @@ fn too_large_for_peer(len: u64, max: u64) -> TransportError {
 }
 
 #[cfg(test)]
-#[path = "connection_tests.rs"]
 mod tests;

@@ -13,7 +13,7 @@ use super::url::Url;
 
 macro_rules! recorded {
     ($($file:literal),* $(,)?) => {
-        [$(($file, include_bytes!(concat!("../../tests/data/jade_http/", $file, ".bin")).as_slice())),*]
+        [$(($file, include_bytes!(concat!("../../../tests/data/jade_http/", $file, ".bin")).as_slice())),*]
     };
 }
 
