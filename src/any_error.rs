@@ -16,22 +16,22 @@ use fipa_transport::{Forked, IncarnationError, ListenError, LocationError, Trans
 
 #[cfg(feature = "actions")]
 use crate::actions::{ActionError, GoalError, OfferError};
-use crate::coalition::CoalitionError;
+use crate::admin::contact::{AddressError, IntroduceError};
+#[cfg(feature = "secure")]
+use crate::admin::keys::KeysError;
+use crate::admin::routes::AskError;
 use crate::config::{ConfigError, RuleError};
-use crate::contact::{AddressError, IntroduceError};
-use crate::domain_dir::DomainDirError;
+use crate::domain::coalition::CoalitionError;
+use crate::domain::files::DomainDirError;
 #[cfg(feature = "protocols")]
 use crate::error::ProtocolError;
 use crate::error::{OpenError, ReceiveError, SendError};
-#[cfg(feature = "secure")]
-use crate::keys::KeysError;
 #[cfg(feature = "locks")]
 use crate::locks::{AdmitError, LockError, OwnError, StateFileError};
 #[cfg(feature = "protocols")]
 use crate::platform::PlatformError;
 #[cfg(feature = "protocols")]
 use crate::protocol::DialogueError;
-use crate::routes::AskError;
 
 /// The result of a program that uses this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;

@@ -14,10 +14,10 @@ use fipa_sds::MdnsError;
 use fipa_sds::{EntryError, HostError, RegisterError};
 use fipa_transport::{Forked, Kind, ListenError};
 
-use crate::config::{ConfigError, RuleError};
-use crate::domain_dir::{DomainDir, DomainDirError};
 #[cfg(feature = "secure")]
-use crate::keys::KeysError;
+use crate::admin::keys::KeysError;
+use crate::config::{ConfigError, RuleError};
+use crate::domain::files::{DomainDir, DomainDirError};
 
 /// The error of [`Domain::open`](crate::Domain::open) and of opening a gateway or a watcher.
 #[derive(Debug, thiserror::Error)]

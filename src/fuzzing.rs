@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use fipa_transport::Incarnation;
 
-use crate::access::{self, LetterFacts};
+use crate::access::rules::{self, LetterFacts};
 use crate::config::{AccessRule, Config, ConfigError, Effective, Sources};
 
 /// Parses and checks a text as the content of `fipa.toml`, with these overrides (`key=value`).
@@ -34,7 +34,7 @@ pub fn gateway_state(bytes: &[u8]) {
 
 /// The access rules, and the rates of senders.
 #[derive(Debug)]
-pub struct Access(access::Access);
+pub struct Access(rules::Access);
 
 /// Entries of rules, each a sender and its receivers.
 pub type Lines<'a> = &'a [(&'a str, Vec<&'a str>)];

@@ -82,9 +82,9 @@
 //!
 //! # Examples and tools
 //!
-//! The directory `examples` of the repository has a program per topic. [`watch`] observes the letters of
-//! all processes of a domain on this host, [`routes`] reports the routes that letters would take now,
-//! [`doctor`] checks a machine, [`keys`] (feature `secure`) manages the keys of this host, and
+//! The directory `examples` of the repository has a program per topic. [`watch`](admin::watch) observes the letters of
+//! all processes of a domain on this host, [`routes`](admin::routes) reports the routes that letters would take now,
+//! [`doctor`](admin::doctor) checks a machine, [`keys`](admin::keys) (feature `secure`) manages the keys of this host, and
 //! [`Gateway`] (feature `net`) is the gateway that `fipa up` runs. `docs/architecture.md` describes the
 //! other crates: delivery, transports and protocols.
 //!
@@ -97,88 +97,42 @@
     doc = "[`Gateway`]: https://docs.rs/fipa/latest/fipa/struct.Gateway.html"
 )]
 #![cfg_attr(
-    not(feature = "secure"),
-    doc = "[`keys`]: https://docs.rs/fipa/latest/fipa/keys/index.html"
-)]
-#![cfg_attr(
     not(feature = "locks"),
     doc = "[`locks`]: https://docs.rs/fipa/latest/fipa/locks/index.html"
 )]
 
 mod access;
-mod access_gate;
-#[cfg(feature = "actions")]
-mod action_table;
 #[cfg(feature = "actions")]
 pub mod actions;
+pub mod admin;
 mod agent;
 mod any_error;
-mod background;
 pub mod blocking;
-#[cfg(feature = "protocols")]
-mod checks;
-#[cfg(not(feature = "protocols"))]
-#[path = "checks_disabled.rs"]
-mod checks;
-mod coalition;
 pub mod config;
-pub mod contact;
-mod delivery;
-#[cfg(feature = "protocols")]
-mod delivery_report;
-#[cfg(feature = "protocols")]
-mod demultiplexer;
-#[cfg(not(feature = "protocols"))]
-#[path = "demultiplexer_disabled.rs"]
-mod demultiplexer;
-mod dir_maintenance;
-mod directory_view;
-pub mod doctor;
 mod domain;
-mod domain_dir;
-mod endpoint;
 mod error;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing;
 #[cfg(feature = "net")]
 mod gateway;
-mod host_directory;
-mod incoming;
-#[cfg(feature = "secure")]
-pub mod keys;
-#[cfg(feature = "locks")]
-mod lock_slot;
-#[cfg(not(feature = "locks"))]
-#[path = "lock_slot_disabled.rs"]
-mod lock_slot;
 #[cfg(feature = "locks")]
 pub mod locks;
-pub mod open_files;
-mod owner;
-#[cfg(feature = "protocols")]
-mod peer_shares;
 #[cfg(feature = "protocols")]
 pub mod platform;
-#[cfg(any(feature = "protocols", feature = "net"))]
-mod presence;
 #[cfg(feature = "protocols")]
 pub mod protocol;
-pub mod routes;
-mod sender_tasks;
-mod service;
-mod stated;
-mod user_dir;
-pub mod watch;
 
+pub use agent::delivery::{Deliveries, Delivery};
+pub use agent::incoming::Incoming;
+pub use agent::sender_tasks::SenderTasks;
 pub use agent::{Agent, Loan, Unread};
 pub use any_error::{Error, Result};
-pub use coalition::{Coalition, CoalitionError};
 pub use config::Config;
-pub use delivery::{Deliveries, Delivery};
-pub use directory_view::DirectoryView;
+pub use domain::coalition::{Coalition, CoalitionError};
+pub use domain::directory_view::DirectoryView;
+pub use domain::files::DomainDirError;
 pub use domain::{Domain, RegisterOptions};
-pub use domain_dir::DomainDirError;
 #[cfg(feature = "protocols")]
 pub use error::ProtocolError;
 pub use error::{OpenError, ReceiveError, SendError};
@@ -204,5 +158,3 @@ pub use fipa_transport::{
 pub use fipa_transport::{log_limit, threads};
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbor};
-pub use incoming::Incoming;
-pub use sender_tasks::SenderTasks;

@@ -250,7 +250,7 @@ async fn a_letter_with_a_line_break_in_the_name_of_its_sender_is_refused() {
 #[cfg(feature = "secure")]
 #[tokio::test(flavor = "multi_thread")]
 async fn a_certified_peer_evades_no_rule_by_a_line_break() {
-    use fipa::keys::{Keys, VALID};
+    use fipa::admin::keys::{Keys, VALID};
     use fipa_transport_net::secure::{Rules, Security};
 
     let home = tempfile::tempdir().unwrap();

@@ -5,8 +5,8 @@ use std::error::Error;
 use std::io;
 use std::sync::Arc;
 
+use fipa::admin::routes::AskError;
 use fipa::config::ConfigError;
-use fipa::routes::AskError;
 use fipa::{
     CoalitionError, DeregisterError, DomainDirError, EncodeError, EntryError, ErrorChain,
     HostError, Kind, ListenError, MembersError, NameError, OpenError, PostError, RegisterError,
@@ -117,14 +117,14 @@ fn errors() -> Vec<(Box<dyn Error>, String)> {
     #[cfg(feature = "secure")]
     all.extend([
         (
-            Box::new(OpenError::Keys(fipa::keys::KeysError::Io {
+            Box::new(OpenError::Keys(fipa::admin::keys::KeysError::Io {
                 path: path(),
                 source: cause(),
             })) as Box<dyn Error>,
             format!("cannot use security.keys: cannot use /dir: {CAUSE}"),
         ),
         (
-            Box::new(fipa::keys::KeysError::Make(Box::new(cause()))),
+            Box::new(fipa::admin::keys::KeysError::Make(Box::new(cause()))),
             format!("cannot make a key: {CAUSE}"),
         ),
     ]);
@@ -178,7 +178,7 @@ fn every_error_of_the_crate_converts_into_the_top_error() {
     assert!(names.len() > 15, "{names:?}");
     let modules = [
         include_str!("../src/actions/mod.rs"),
-        include_str!("../src/contact.rs"),
+        include_str!("../src/admin/contact.rs"),
         include_str!("../src/locks/mod.rs"),
     ];
     let public = modules.map(|module| {

@@ -8,7 +8,7 @@ mod support;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa::routes::{self, RouteState, Standing};
+use fipa::admin::routes::{self, RouteState, Standing};
 use fipa::{
     Agent, Config, Deliveries, Domain, ErrorChain, FailureReason, Gateway, Kind, OpenError,
     Outcome, Performative, Query, TransportErrorKind,

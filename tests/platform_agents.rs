@@ -621,7 +621,7 @@ async fn no_process_and_no_other_platform_takes_the_name_of_a_gateways_agent() {
     for (name, is_reserved) in [(format!("df@{own}"), true), ("df@jade".to_owned(), false)] {
         let id = AgentId::new(&*name).unwrap();
         let id = id.with_address("tcp://127.0.0.1:9;fipa-services").unwrap();
-        let introduced = fipa::contact::introduce(&rover, &entry, &id, TIMEOUT).await;
+        let introduced = fipa::admin::contact::introduce(&rover, &entry, &id, TIMEOUT).await;
         match introduced {
             Ok(()) => assert!(!is_reserved, "{name}"),
             Err(error) => {

@@ -9,10 +9,8 @@ mod support;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa::{
-    AgentId, Domain, Gateway, Kind, Letter, Message, Neighbor, Outcome, Performative, contact,
-    routes,
-};
+use fipa::admin::{contact, routes};
+use fipa::{AgentId, Domain, Gateway, Kind, Letter, Message, Neighbor, Outcome, Performative};
 use fipa_testbed::until_async;
 use stranger::Stranger;
 use support::config;

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa::watch::{Event, Fate, Passage, WatchOptions, Watcher};
+use fipa::admin::watch::{Event, Fate, Passage, WatchOptions, Watcher};
 use fipa::{
     Agent, AgentId, Config, Domain, FailureReason, Gateway, Kind, Message, Outcome, Performative,
 };

@@ -7,9 +7,10 @@ mod support;
 use std::fs;
 use std::time::Duration;
 
-use fipa::keys::{Keys, VALID};
+use fipa::admin::keys::{Keys, VALID};
+use fipa::admin::routes;
 use fipa::platform::{AgentDescription, ServiceDescription};
-use fipa::{Agent, Config, Domain, FailureReason, Gateway, Kind, Outcome, routes};
+use fipa::{Agent, Config, Domain, FailureReason, Gateway, Kind, Outcome};
 use fipa_testbed::until_async;
 use support::{config, inform, mark};
 

@@ -7,7 +7,7 @@
 use std::collections::HashSet;
 use std::time::{Duration, Instant};
 
-use fipa::contact::{self, IntroduceError};
+use fipa::admin::contact::{self, IntroduceError};
 use fipa::{Agent, AgentId, Entry, Incarnation, Message, Performative};
 use serde::Serialize;
 

@@ -5,7 +5,7 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use fipa::ErrorChain;
-use fipa::keys::{Keys, KeysError, VALID};
+use fipa::admin::keys::{Keys, KeysError, VALID};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 

@@ -36,7 +36,7 @@ fn main() -> ExitCode {
     complete::answer();
     let command_line = options::CommandLine::read();
     log_to_stderr(&command_line.global);
-    if let Err(error) = fipa::open_files::raise() {
+    if let Err(error) = fipa::admin::open_files::raise() {
         tracing::debug!(%error, "cannot raise the limit of open files");
     }
     match command::run(command_line.command, &command_line.global) {

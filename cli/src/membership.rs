@@ -7,11 +7,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
-use fipa::routes::{self, AskError, Report};
+use fipa::admin::contact;
+use fipa::admin::routes::{self, AskError, Report};
 use fipa::threads::ThreadError;
 use fipa::{
     Agent, AgentId, Config, Domain, DomainDirError, Entry, ErrorChain, Incarnation, ListenError,
-    OpenError, Reach, RegisterError, RegisterOptions, Role, contact,
+    OpenError, Reach, RegisterError, RegisterOptions, Role,
 };
 use fipa_acl::{escape, escape_name};
 use rustix::process::Signal;

@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use fastrand::Rng;
 use fipa::Incarnation;
-use fipa::keys::Keys;
+use fipa::admin::keys::Keys;
 use fipa_testbed::until;
 use fuzzing::trusted::{client, quic};
 use fuzzing::{Writer, datagram, stream};

@@ -26,7 +26,7 @@ use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa::keys::Keys;
+use fipa::admin::keys::Keys;
 use fipa_testbed::{ChildGuard, frame, ignored_test};
 use fuzzing::trusted::{client, quic};
 use fuzzing::{Writer, datagram, stream};

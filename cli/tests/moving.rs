@@ -15,8 +15,8 @@ use std::process::Stdio;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use fipa::admin::keys::{Keys, VALID};
 use fipa::config::Sources;
-use fipa::keys::{Keys, VALID};
 use fipa::{Agent, AgentId, Config, Deliveries, Domain, Entry, Incarnation, Outcome, Performative};
 use fipa_testbed::{ChildGuard, Family, Host, Network, enter, isolated};
 use serde_json::Value;

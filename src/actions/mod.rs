@@ -81,6 +81,7 @@
 mod client;
 mod offer;
 mod server;
+pub(crate) mod table;
 
 pub use client::{ActionError, GoalHandle, ProgressUpdates, Robot, StatusUpdates};
 pub use fipa_actions::{
@@ -90,6 +91,6 @@ pub use fipa_actions::{
 pub use fipa_content::Term;
 pub use offer::{Action, Offer, OfferError};
 
-pub use crate::action_table::Execution;
+pub use crate::actions::table::Execution;
 #[cfg(doc)]
-use crate::{Agent, protocol::DialogueError};
+use crate::protocol::DialogueError;

@@ -13,7 +13,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::server;
-use crate::action_table::{ActionTable, Execution, Handler, Outcome};
+use crate::actions::table::{ActionTable, Execution, Handler, Outcome};
 use crate::agent::Agent;
 use crate::protocol::DialogueError;
 

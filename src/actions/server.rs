@@ -9,7 +9,7 @@ use fipa_actions::{
     Answer, Ask, Failure, Goal, Language, MAX_CONTENT, ONTOLOGY, Refusal, language,
 };
 
-use crate::action_table::ActionTable;
+use crate::actions::table::ActionTable;
 use crate::agent::AgentCore;
 use crate::protocol::{DialogueError, Reply, Task, serve_those};
 

@@ -10,11 +10,12 @@ use serde::de::DeserializeOwned;
 use tokio::runtime::Handle;
 
 use super::{Agent, Background, Waiter};
+use crate::AgentId;
 use crate::actions::{
     self, Action, ActionDescription, ActionError, Execution, Goal, GoalError, GoalStatus,
     OfferError, Term,
 };
-use crate::{AgentId, background};
+use crate::domain::background;
 
 /// An offered action; see [`crate::actions::Offer`].
 #[derive(Debug)]

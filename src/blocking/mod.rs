@@ -38,9 +38,9 @@ use fipa_sds::{Cancellation, DeregisterError, RegisterError};
 use fipa_transport::threads;
 use tokio::runtime::{Builder, Handle, Runtime};
 
+use crate::admin::routes::Report;
 use crate::config::Sources;
-use crate::owner::Owner;
-use crate::routes::Report;
+use crate::domain::process::Owner;
 use crate::{
     AgentId, Change, Coalition, CoalitionError, Config, Deliveries, DirectoryView, Entry,
     Incarnation, Incoming, Loan, OpenError, Query, ReceiveError, RegisterOptions, SendError,

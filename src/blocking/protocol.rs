@@ -11,11 +11,12 @@ use fipa_acl::{Message, MessageBuilder, Performative};
 use tokio::runtime::Handle;
 
 use super::{Agent, Background, Waiter};
+use crate::domain::background;
 use crate::protocol::{
     Auction, Awarded, Bids, ContractNet, Decision, DialogueError, PartnerEvent, PartnerWatch,
     Proxied, Publisher, Reply, Request, Server, Subscription, Task,
 };
-use crate::{AgentId, AgentIdError, Incoming, background};
+use crate::{AgentId, AgentIdError, Incoming};
 
 /// One side of a conversation with blocking calls: a [`Request`], [`Subscription`], [`ContractNet`],
 /// [`Auction`], [`Proxied`] or [`Task`], or a [`Server`], [`Publisher`] or [`PartnerWatch`]. Dereferences to that type for the calls that do not wait.

@@ -271,7 +271,7 @@ impl Findings {
                 continue;
             }
             for line in lines {
-                if let Some(fault) = crate::access::fault(line.parts()) {
+                if let Some(fault) = crate::access::rules::fault(line.parts()) {
                     self.add(
                         &["access", name, &line.sender],
                         fault,

@@ -115,7 +115,7 @@ fn keys(_config: &Config, _found: &mut Vec<Finding>) {}
 fn keys(config: &Config, found: &mut Vec<Finding>) {
     use fipa_acl::ErrorChain;
 
-    use crate::keys::{Keys, KeysError};
+    use crate::admin::keys::{Keys, KeysError};
 
     let dir = &config.security.keys;
     // `~` is reported with the values.

@@ -93,8 +93,8 @@ pub use effective::{Effective, Setting, Value};
 pub use error::{ConfigError, Mistake, Origin};
 pub use sources::Sources;
 
-use crate::access;
-pub use crate::access::RuleError;
+use crate::access::rules;
+pub use crate::access::rules::RuleError;
 
 /// A complete and checked configuration.
 ///
@@ -145,7 +145,7 @@ pub struct Mts {
     /// Beyond it their senders wait. An empty queue accepts a letter of any size.
     pub queue_bytes: u64,
     /// `raise_open_files`: whether a process that joins a domain raises its soft limit of open files to the hard one;
-    /// see [`open_files`](crate::open_files). Programs that use `select` do not work with more than 1,024 open files.
+    /// see [`open_files`](crate::admin::open_files). Programs that use `select` do not work with more than 1,024 open files.
     pub raise_open_files: bool,
 }
 
@@ -331,10 +331,10 @@ impl AccessRule {
 
 impl Access {
     /// The rules that this section configures; `None` if it has none.
-    pub(crate) fn rules(&self) -> Result<Option<access::Access>, RuleError> {
+    pub(crate) fn rules(&self) -> Result<Option<rules::Access>, RuleError> {
         let deny = self.deny.iter().map(AccessRule::parts);
         let allow = self.allow.iter().map(AccessRule::parts);
-        access::Access::new(deny, allow, self.rate)
+        rules::Access::new(deny, allow, self.rate)
     }
 }
 

@@ -26,9 +26,9 @@ use super::Network;
 use super::exchange_queues::{ExchangeQueues, Unread};
 use super::names::{Contested, contested, own_agents};
 use super::neighbors::{Neighbor, Neighbors};
-use crate::background::{self, BackgroundError};
-use crate::routes::ContestedName;
-use crate::service::Service;
+use crate::admin::routes::ContestedName;
+use crate::domain::background::{self, BackgroundError};
+use crate::domain::service::Service;
 
 /// The receiver of a greeting to a service whose name is not known. It is not read.
 const UNNAMED: &str = "gateway";

@@ -26,10 +26,10 @@ use super::introductions::Grounds;
 use super::namesakes::Namesakes;
 use super::neighbors::Neighbors;
 use super::presence::{QuestionRates, Questions};
-use crate::contact::{self, Introduced};
-use crate::presence;
-use crate::routes;
-use crate::service::Service;
+use crate::admin::contact::{self, Introduced};
+use crate::admin::routes;
+use crate::domain::presence;
+use crate::domain::service::Service;
 
 /// Deadline for the delivery of an answer.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);

@@ -8,10 +8,10 @@ use fipa_transport::log_limit;
 use fipa_transport_net::secure::{Credentials, Rules, Security};
 use tokio::runtime::Handle;
 
-use crate::background::{self, BackgroundError};
+use crate::admin::keys::{Holding, Keys, Stamp, Whose};
 use crate::config;
+use crate::domain::background::{self, BackgroundError};
 use crate::error::OpenError;
-use crate::keys::{Holding, Keys, Stamp, Whose};
 
 /// Interval between checks for changed keys. A check makes three system calls.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
@@ -172,7 +172,7 @@ mod tests {
     use std::fs;
 
     use super::*;
-    use crate::keys::{Certificate, VALID};
+    use crate::admin::keys::{Certificate, VALID};
 
     /// Keys that trust two peers, and their guard.
     struct Scene {

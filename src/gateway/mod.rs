@@ -58,11 +58,12 @@ use self::publisher::{PublishTask, Publisher};
 pub(crate) use self::state::play as play_state;
 use self::state::{Predecessor, StateFile, Trust};
 use crate::config::ConfigError;
-use crate::directory_view::DirectoryView;
+use crate::domain::background;
+use crate::domain::directory_view::DirectoryView;
+use crate::domain::process::Owner;
+use crate::domain::service::{Role, Service};
 use crate::error::OpenError;
-use crate::owner::Owner;
-use crate::service::{Role, Service};
-use crate::{AgentId, Config, background};
+use crate::{AgentId, Config};
 
 /// A running gateway. Ends when [`close`](Self::close) is called or the value is dropped.
 pub struct Gateway {

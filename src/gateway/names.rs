@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use fipa_sds::{Directory, Entry, HostDirectory, Reach, Role};
 
-use crate::routes::{ASKER_TYPE, ContestedName};
+use crate::admin::routes::{ASKER_TYPE, ContestedName};
 
 /// Returns the agents and coalitions of this host that are announced to other hosts. Agents that query
 /// this gateway are not announced.

@@ -12,7 +12,7 @@ use fipa_sds::{Directory, MergedDirectory, Mts, Reach};
 use fipa_transport::{Incarnation, Location, log_limit};
 
 use super::neighbors::{Neighbor, Neighbors};
-use crate::routes;
+use crate::admin::routes;
 
 /// Time for which two gateways of one name must have been connected together. A gateway that was restarted has a
 /// new incarnation, while the connection of the former one may be open until it has been silent for 20 s.

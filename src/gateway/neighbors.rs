@@ -22,7 +22,7 @@ use fipa_transport::{
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
-use crate::routes::{Connected, LinkSecurity};
+use crate::admin::routes::{Connected, LinkSecurity};
 
 /// The gateways with an open connection. The number of connections bounds their number.
 #[derive(Debug, Default)]

@@ -30,7 +30,7 @@ use super::names::other_claim;
 use super::neighbors::Neighbors;
 use super::state::{Predecessor, StateFile};
 use crate::config;
-use crate::service::Service;
+use crate::domain::service::Service;
 
 /// Deadline for the delivery of an answer.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);

@@ -17,7 +17,7 @@ use fipa_sds::{Directory, Entry, Reach, Role, Source};
 use fipa_transport::{Incarnation, PeerId, TokenBucket, log_limit};
 
 use super::gateway_agent::GatewayAgent;
-use crate::presence::{self, Answer, Asked, MAX_ASKED};
+use crate::domain::presence::{self, Answer, Asked, MAX_ASKED};
 
 /// Time for which further questions to a gateway wait for its answer to the previous letter.
 const IN_FLIGHT: Duration = Duration::from_millis(200);

@@ -17,7 +17,7 @@ use super::Network;
 use super::names::own_agents;
 use super::publish_pace::PublishPace;
 use crate::config::is_on_loopback;
-use crate::service::Service;
+use crate::domain::service::Service;
 
 /// Time between looks for lost agents that have ended, which causes no notification.
 const LOST_CHECK: Duration = Duration::from_secs(15);

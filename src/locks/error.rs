@@ -8,7 +8,7 @@ use fipa_transport::Forked;
 use fipa_transport::threads::ThreadError;
 
 use super::StateFileError;
-use crate::background::BackgroundError;
+use crate::domain::background::BackgroundError;
 use crate::error::SendError;
 
 /// The error if an agent does not get a lock, or has lost it.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use fipa_locking::Peer;
 use fipa_transport::{PeerId, TokenBucket};
 
-use crate::peer_shares::PeerShares;
+use crate::protocol::peer_shares::PeerShares;
 
 /// Greetings a second to the agents that one peer announces, and of them at once.
 const OF_PEER: (f64, f64) = (20.0, 256.0);

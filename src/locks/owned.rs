@@ -15,8 +15,9 @@ use super::shell::{self, Shared};
 use super::state_file::StateFile;
 use super::{AdmitError, LockError, OwnError, ResourceStatus, clock, message};
 use crate::agent::AgentCore;
-use crate::coalition::CoalitionError;
-use crate::{Coalition, DirectoryView, RegisterOptions, background};
+use crate::domain::background;
+use crate::domain::coalition::CoalitionError;
+use crate::{Coalition, DirectoryView, RegisterOptions};
 
 /// Type of the directory's entry of an owned resource.
 pub(super) const TYPE: &str = "fipa-lock";

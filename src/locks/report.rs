@@ -21,8 +21,8 @@ use serde::{Deserialize, Serialize};
 use super::shell::Shared;
 use super::{LockError, owned};
 use crate::agent::AgentCore;
-use crate::demultiplexer::{Admitted, Party, ReaderKey};
-use crate::lock_slot::STATUS_PROTOCOL;
+use crate::agent::demultiplexer::{Admitted, Party, ReaderKey};
+use crate::agent::lock_slot::STATUS_PROTOCOL;
 
 /// Maximum length of the content of an answer, in bytes.
 const MAX_CONTENT: usize = 1 << 20;

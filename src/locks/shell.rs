@@ -25,12 +25,13 @@ use super::greetings::Greetings;
 use super::owned::{Holding, OwnerEvent};
 use super::state_file::StateFile;
 use super::{LockError, LockOptions, report};
+use crate::DirectoryView;
 use crate::agent::AgentCore;
-use crate::demultiplexer::ReaderKey;
-use crate::incoming::Incoming;
-use crate::lock_slot::{self, Running, Slot};
+use crate::agent::demultiplexer::ReaderKey;
+use crate::agent::incoming::Incoming;
+use crate::agent::lock_slot::{self, Running, Slot};
+use crate::domain::background;
 use crate::protocol::{PartnerEvent, PartnerWatch};
-use crate::{DirectoryView, background};
 
 /// Maximum number of events that wait for the application of an owner. Beyond it, the earliest is
 /// dropped.

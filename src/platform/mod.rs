@@ -50,7 +50,7 @@ use fipa_sds::{Entry, Reach};
 
 pub use self::notifications::Notifications;
 use crate::agent::{Agent, AgentCore};
-use crate::directory_view::DirectoryView;
+use crate::domain::directory_view::DirectoryView;
 use crate::protocol::{DialogueError, Request, Subscription};
 
 /// The error of a call to a directory facilitator or an agent management system.

@@ -10,8 +10,8 @@ use super::bids::{Bids, Next};
 use super::dialogue::{Dialogue, DialogueError, after, name_of, settle, unreached};
 use super::reachability::Reachability;
 use super::receivers::expand;
+use crate::agent::delivery::Sent;
 use crate::agent::{Agent, AgentCore};
-use crate::delivery::Sent;
 
 impl Agent {
     /// Opens an English auction (FIPA00031), in which the price rises. The message, an `inform`,

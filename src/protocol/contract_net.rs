@@ -12,8 +12,8 @@ use super::dialogue::{
 };
 use super::reachability::Reachability;
 use super::receivers::{expand, identified};
+use crate::agent::delivery::{Sent, deliveries};
 use crate::agent::{Agent, AgentCore};
-use crate::delivery::{Sent, deliveries};
 
 impl Agent {
     /// Calls for proposals (`cfp`, FIPA00029) and collects the answers until all receivers have

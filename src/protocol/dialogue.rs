@@ -18,11 +18,11 @@ use super::partners::PartnerEvent;
 use super::reachability::{Reachability, ReachabilitySender};
 use super::watching::PartnerWatch;
 use crate::agent::AgentCore;
-use crate::checks::{header_of_outcomes, now};
-use crate::delivery::{Deliveries, Delivery, Sent, deliveries};
-use crate::demultiplexer::{Admitted, Party, ReaderKey};
+use crate::agent::checks::{header_of_outcomes, now};
+use crate::agent::delivery::{Deliveries, Delivery, Sent, deliveries};
+use crate::agent::demultiplexer::{Admitted, Party, ReaderKey};
+use crate::agent::incoming::Incoming;
 use crate::error::{ReceiveError, SendError};
-use crate::incoming::Incoming;
 
 /// Maximum number of `reply-to` names of a participant that are followed.
 const MAX_DELEGATES: usize = 16;

@@ -5,8 +5,8 @@ use std::fmt;
 use fipa_monitor::{History, SnapshotError};
 use fipa_sds::DeregisterError;
 
+use crate::agent::checks::Checks;
 use crate::agent::{Agent, Unread};
-use crate::checks::Checks;
 
 /// An agent that was deregistered in order to register again, on this host or on another one.
 pub struct Departure {

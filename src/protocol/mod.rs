@@ -51,6 +51,7 @@ mod history;
 mod initiator;
 mod participant;
 mod partners;
+pub(crate) mod peer_shares;
 mod proxied;
 mod publisher;
 mod reachability;

@@ -11,9 +11,9 @@ use super::dialogue::{
     Dialogue, DialogueError, Speaker, after, name_of, only_delivered, unreached,
 };
 use super::receivers::expand;
+use crate::agent::delivery::deliveries;
+use crate::agent::incoming::Incoming;
 use crate::agent::{Agent, AgentCore};
-use crate::delivery::deliveries;
-use crate::incoming::Incoming;
 
 /// The last message of a participant.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use fipa_sds::{Change, Entry, Reach};
 use fipa_transport::Incarnation;
 
-use crate::presence::{Answer, Asked};
+use crate::domain::presence::{Answer, Asked};
 
 /// Time between the proof that a registration has ended and the event. Letters that the agent sent
 /// before, and the new registration of an agent that moves, may arrive in the meantime.

@@ -13,9 +13,9 @@ use tokio::task::{JoinHandle, JoinSet};
 
 use super::dialogue::{Dialogue, DialogueError, name_of};
 use super::serving::{ServedQueue, opening, refuse};
+use crate::agent::incoming::Incoming;
 use crate::agent::{Agent, AgentCore};
-use crate::incoming::Incoming;
-use crate::peer_shares::PeerPlaces;
+use crate::protocol::peer_shares::PeerPlaces;
 
 /// Maximum number of notifications that wait for one subscriber. Beyond it, `publish` waits.
 const MAX_WAITING: usize = 64;

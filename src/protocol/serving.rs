@@ -11,10 +11,10 @@ use tokio::task::{JoinError, JoinHandle};
 
 use super::dialogue::{DialogueError, opens};
 use super::participant::{Farewell, Home, Reply, Task};
+use crate::agent::demultiplexer::{Opens, ReaderKey};
+use crate::agent::incoming::Incoming;
 use crate::agent::{Agent, AgentCore};
-use crate::demultiplexer::{Opens, ReaderKey};
-use crate::incoming::Incoming;
-use crate::peer_shares::PeerPlaces;
+use crate::protocol::peer_shares::PeerPlaces;
 
 /// Maximum number of handlers of one server that run at the same time. One host alone gets a quarter of them. Further
 /// initiators of a host that has its share are refused.

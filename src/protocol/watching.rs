@@ -11,10 +11,10 @@ use fipa_sds::{Change, Directory, Entry, Reach, Role, Watch};
 use fipa_transport::{Incarnation, log_limit};
 
 use super::partners::{PartnerEvent, Partners};
+use crate::agent::demultiplexer::{Admitted, Party, ReaderKey};
+use crate::agent::incoming::Incoming;
 use crate::agent::{Agent, AgentCore};
-use crate::demultiplexer::{Admitted, Party, ReaderKey};
-use crate::incoming::Incoming;
-use crate::presence::{self, Asked};
+use crate::domain::presence::{self, Asked};
 
 impl Agent {
     /// Watches whether other agents are gone or unreachable. For conversations that the application

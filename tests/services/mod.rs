@@ -267,9 +267,9 @@ impl TestService {
 /// Makes keys for services that trust each other and no other service.
 #[cfg(feature = "secure")]
 pub(crate) fn mutual_keys<const N: usize>(here: &Path, names: [&str; N]) -> [Security; N] {
-    let keys = names.map(|name| fipa::keys::Keys::at(here.join(format!("keys-{name}"))));
+    let keys = names.map(|name| fipa::admin::keys::Keys::at(here.join(format!("keys-{name}"))));
     for (keys, name) in keys.iter().zip(names) {
-        keys.init(name, &[], fipa::keys::VALID).unwrap();
+        keys.init(name, &[], fipa::admin::keys::VALID).unwrap();
     }
     for (at, one) in keys.iter().enumerate() {
         let others = keys.iter().enumerate().filter(|(other, _)| *other != at);

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use fipa::Config;
-use fipa::watch::{Event as WatchEvent, WatchOptions, Watcher};
+use fipa::admin::watch::{Event as WatchEvent, WatchOptions, Watcher};
 use tokio::io::{BufReader, Lines, Stdin};
 use tokio::time::Instant;
 

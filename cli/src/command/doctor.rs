@@ -1,7 +1,7 @@
 //! `fipa doctor`: checks this machine.
 
 use clap::Args;
-use fipa::doctor::{Check, Verdict, examine, examine_gateway};
+use fipa::admin::doctor::{Check, Verdict, examine, examine_gateway};
 use fipa::{Config, Domain};
 use fipa_acl::escape;
 use serde_json::json;

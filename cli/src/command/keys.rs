@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime};
 use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, Subcommand};
 use fipa::ErrorChain;
-use fipa::keys::{Certificate, Holding, Keys, KeysError, VALID, Whose};
+use fipa::admin::keys::{Certificate, Holding, Keys, KeysError, VALID, Whose};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 

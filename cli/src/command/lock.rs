@@ -7,8 +7,9 @@ use std::process::ExitStatus;
 use std::time::Duration;
 
 use clap::Args;
+use fipa::admin::open_files;
 use fipa::locks::{Lock, LockError};
-use fipa::{Agent, AgentId, Config, ErrorChain, Incarnation, RegisterOptions, open_files};
+use fipa::{Agent, AgentId, Config, ErrorChain, Incarnation, RegisterOptions};
 use rustix::process::{Pid, Signal, kill_process_group, test_kill_process_group};
 use tokio::process::{Child, Command};
 

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 use comfy_table::Table;
-use fipa::routes::{Connected, Report, Route, RouteState, Standing};
+use fipa::admin::routes::{Connected, Report, Route, RouteState, Standing};
 use fipa::{Matcher, Query};
 use fipa_acl::{escape, escape_name};
 use serde_json::json;

@@ -1,7 +1,7 @@
 //! `fipa up`: the gateway of a domain.
 
 use clap::Args;
-use fipa::keys::{Certificate, Keys};
+use fipa::admin::keys::{Certificate, Keys};
 use fipa::{Change, Config, Entry, Gateway, Reach, log_limit};
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};

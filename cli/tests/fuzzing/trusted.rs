@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fipa::keys::Keys;
+use fipa::admin::keys::Keys;
 use fipa_testbed::AnyPeer;
 use quinn::crypto::rustls::QuicClientConfig;
 use rustls::ClientConfig;

@@ -4,7 +4,7 @@
 
 use std::process::{Command, Stdio};
 
-use fipa::keys::{Keys, VALID};
+use fipa::admin::keys::{Keys, VALID};
 use fipa_testbed::Host;
 
 /// The port of every gateway.

@@ -17,8 +17,8 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use fipa::admin::keys::{Keys, VALID};
 use fipa::config::Sources;
-use fipa::keys::{Keys, VALID};
 use fipa::{Agent, AgentId, Config, Domain, Incarnation, Outcome, Performative};
 use fipa_testbed::{ChildGuard, until};
 use parking_lot::Mutex;

@@ -81,7 +81,7 @@ fn unusual_host_names_yield_a_valid_name() {
 /// The file in the documentation contains the defaults, except for tables that are empty by default.
 #[test]
 fn the_documented_file_is_the_default() {
-    let documentation = include_str!("../../config.rs");
+    let documentation = include_str!("../mod.rs");
     let block = documentation.split("```").nth(1).unwrap();
     let sample: String = block
         .lines()

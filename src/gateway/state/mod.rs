@@ -24,8 +24,8 @@ use tokio::runtime::Handle;
 use tokio::sync::Notify;
 
 use super::neighbors::Neighbors;
-use crate::background;
-use crate::domain_dir::DomainDir;
+use crate::domain::background;
+use crate::domain::files::DomainDir;
 
 const VERSION: u32 = 1;
 

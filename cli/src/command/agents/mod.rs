@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
-use fipa::routes::{ASKER_TYPE, LinkSecurity};
+use fipa::admin::routes::{ASKER_TYPE, LinkSecurity};
 use fipa::{
     DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role,
     Signature, Source, Time,

@@ -7,9 +7,9 @@
 use std::io::Write;
 use std::time::{Duration, Instant};
 
+use fipa::admin::watch::{WatchOptions, Watcher};
 use fipa::locks::{Fence, Lock, OwnOptions, Owned, with_fences};
 use fipa::monitor::Library;
-use fipa::watch::{WatchOptions, Watcher};
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, ErrorChain, Gateway, Incoming, Performative, Reach,
 };
@@ -169,7 +169,7 @@ pub(super) async fn watcher(config: &Config) -> Result<(), String> {
             },
             seen = watcher.next() => seen,
         };
-        let fipa::watch::Event::Letter(passage) = seen else {
+        let fipa::admin::watch::Event::Letter(passage) = seen else {
             continue;
         };
         match checker.check(Letter::of(&passage, &earlier)) {

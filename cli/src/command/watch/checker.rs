@@ -7,7 +7,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa::watch::{Fate, Passage};
+use fipa::admin::watch::{Fate, Passage};
 use fipa::{DeliveryFailure, DirectoryView, Message, Outcome};
 use fipa_acl::Time;
 use fipa_monitor::{

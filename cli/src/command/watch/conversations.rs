@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa::Outcome;
-use fipa::watch::{Fate, Passage};
+use fipa::admin::watch::{Fate, Passage};
 use fipa_acl::{escape, escape_name};
 
 use super::checker::CheckResult;

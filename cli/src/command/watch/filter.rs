@@ -1,6 +1,6 @@
 //! Selects the letters to show.
 
-use fipa::watch::Passage;
+use fipa::admin::watch::Passage;
 use fipa::{Matcher, Performative};
 
 use super::checker::CheckResult;

@@ -1,6 +1,6 @@
 //! Output of `fipa watch` as JSON, one object per line.
 
-use fipa::watch::{Fate, Passage};
+use fipa::admin::watch::{Fate, Passage};
 use fipa::{Attempt, MessageBuilder, Outcome, Time};
 use fipa_acl::json::{letter_to_json, message_to_json};
 use serde_json::{Map, Value, json};

@@ -15,7 +15,7 @@ use std::pin::pin;
 use std::time::{Duration, SystemTime};
 
 use clap::Args;
-use fipa::watch::{Event, Passage, WatchOptions, Watcher};
+use fipa::admin::watch::{Event, Passage, WatchOptions, Watcher};
 use fipa::{Config, Matcher, Performative};
 
 use self::checker::{CheckResult, Checker, Earlier, Letter};

@@ -4,7 +4,7 @@ use std::collections::HashSet;
 use std::time::Instant;
 
 use fipa::Outcome;
-use fipa::watch::{Fate, Passage};
+use fipa::admin::watch::{Fate, Passage};
 
 use super::checker::CheckResult;
 use super::text::{Ink, Look};

@@ -4,7 +4,7 @@ use std::io::IsTerminal;
 use std::time::SystemTime;
 
 use anstyle::{AnsiColor, Style};
-use fipa::watch::{Fate, Passage};
+use fipa::admin::watch::{Fate, Passage};
 use fipa::{Message, Outcome, Time};
 use fipa_acl::{escape, escape_name};
 use fipa_content::{Content, Printer, Profile};

@@ -1,0 +1,379 @@
+//! The access gate of a process: checks arriving letters against the rules of `[access]`.
+//!
+//! The gateway checks the letters that come from other hosts or go there. Every other process
+//! checks the letters to its own agents, because it must not rely on the checks of other processes.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use fipa_acl::{EnvelopeView, Letter, MessageView};
+use fipa_mts::{AccessGate, LetterParts, Link};
+use fipa_sds::{Directory, Entry, HostDirectory, Role as EntryRole};
+use fipa_transport::log_limit;
+use parking_lot::Mutex;
+
+use crate::access::rules::{Access, LetterFacts, Refusal};
+
+/// Log target of the lines about refused letters.
+const AUDIT: &str = "fipa::audit";
+
+/// Checks every arriving letter against the rules.
+pub(crate) struct RulesGate {
+    access: Mutex<Access>,
+    of: Of,
+    /// Whether a rule names an action, so that contents are read.
+    #[cfg(feature = "actions")]
+    names_actions: bool,
+}
+
+/// The owner of a gate.
+pub(crate) enum Of {
+    /// The gateway with this name. Every sender may send letters to the gateway itself, because
+    /// gateways and their agents communicate this way.
+    Gateway(Arc<str>),
+    /// A process of this host, with its directory. The gateway of the host is identified by its
+    /// link. It may send its own letters to every agent, because they are answers only. The letters
+    /// that it forwards are not counted again, because it has counted them.
+    Process(Arc<HostDirectory>),
+}
+
+impl RulesGate {
+    pub(crate) fn new(access: Access, of: Of) -> Self {
+        Self {
+            #[cfg(feature = "actions")]
+            names_actions: access.names_actions(),
+            access: Mutex::new(access),
+            of,
+        }
+    }
+
+    /// Reads the parts of a message with this sender in its envelope.
+    fn parts_of(&self, message: &MessageView<'_>, sender: String) -> LetterParts {
+        let signed = message.sender().map(|it| it.name());
+        let other = signed.filter(|signed| signed.as_str() != sender);
+        let fault = other
+            .map(|signed| format!("its envelope names the sender {sender}, its message {signed}"));
+        LetterParts {
+            performative: message.performative_name().as_str().into_owned(),
+            protocol: message.protocol().map(|it| it.as_str().into_owned()),
+            ontology: message.ontology().map(|it| it.as_str().into_owned()),
+            action: self.action(message),
+            is_stamped: false,
+            fault,
+            sender,
+        }
+    }
+
+    /// Checks a letter to this receiver.
+    fn judge(
+        &self,
+        now: Instant,
+        receiver: &str,
+        letter: &LetterParts,
+        link: Link,
+    ) -> Result<(), Refused> {
+        if let Some(fault) = &letter.fault {
+            return Err(Refused::Other(fault.clone()));
+        }
+        let sender = &*letter.sender;
+        let facts = LetterFacts {
+            sender,
+            receiver,
+            performative: &letter.performative,
+            protocol: letter.protocol.as_deref(),
+            ontology: letter.ontology.as_deref(),
+            action: letter.action.as_deref(),
+        };
+        let judge = |gateway: Option<Arc<Entry>>| match gateway {
+            // The gateway has forwarded this letter: it has stamped and counted it.
+            Some(_) if letter.is_stamped => self.access.lock().judge(&facts),
+            Some(gateway) if *gateway.name == *sender => Ok(()),
+            _ => {
+                let mut access = self.access.lock();
+                access
+                    .judge(&facts)
+                    .and_then(|()| access.count(link.source, sender, now))
+            }
+        };
+        let gateway = self.gateway_on(link);
+        let is_known = gateway.is_some();
+        judge(gateway).or_else(|refusal| {
+            // The gateway may have registered a moment ago. The directory is refreshed only for
+            // letters that would be refused.
+            match self.refreshed_gateway_on(link).filter(|_| !is_known) {
+                Some(gateway) => Ok(judge(Some(gateway))?),
+                None => Err(refusal.into()),
+            }
+        })
+    }
+
+    /// Returns the action of a goal for a robot, if a rule names actions. The content is read as the
+    /// robot reads it, so that no other notation evades a rule.
+    #[cfg(feature = "actions")]
+    fn action(&self, message: &MessageView<'_>) -> Option<String> {
+        if !self.names_actions {
+            return None;
+        }
+        let content = message.content();
+        let content = content.filter(|content| content.len() <= fipa_actions::MAX_CONTENT)?;
+        let language = message.language();
+        let language = language.as_ref().map(|text| text.as_str());
+        match fipa_actions::language(language.as_deref())?.read_ask(&content) {
+            Ok((_, fipa_actions::Ask::Goal(goal))) => Some(goal.action),
+            _ => None,
+        }
+    }
+
+    #[cfg(not(feature = "actions"))]
+    fn action(&self, _message: &MessageView<'_>) -> Option<String> {
+        None
+    }
+
+    /// Returns the entry of the gateway of this host if the directory shows the gateway at the
+    /// other end of this link. The link must be within the host: only there does the kernel prove
+    /// that the other end is a process of this user.
+    fn gateway_on(&self, link: Link) -> Option<Arc<Entry>> {
+        let Of::Process(host) = &self.of else {
+            return None;
+        };
+        if !link.via.is_host_local() {
+            return None;
+        }
+        let entry = host.known_incarnation(link.service)?;
+        (entry.role == EntryRole::Gateway).then_some(entry)
+    }
+
+    /// Like [`gateway_on`](Self::gateway_on), after a refresh of the directory.
+    fn refreshed_gateway_on(&self, link: Link) -> Option<Arc<Entry>> {
+        if let Of::Process(host) = &self.of
+            && link.via.is_host_local()
+        {
+            host.refresh();
+        }
+        self.gateway_on(link)
+    }
+}
+
+/// The reason why a letter is refused.
+#[derive(Debug, thiserror::Error)]
+enum Refused {
+    #[error(transparent)]
+    ByRule(#[from] Refusal),
+    #[error("{0}")]
+    Other(String),
+}
+
+impl AccessGate for RulesGate {
+    fn read(&self, letter: &Letter) -> LetterParts {
+        let envelope = letter.envelope();
+        let view = EnvelopeView::parse(&envelope).ok();
+        let sender = view.as_ref().and_then(EnvelopeView::from_name);
+        let (Some(view), Some(sender)) = (&view, sender) else {
+            return LetterParts {
+                fault: Some("its envelope names no sender".to_owned()),
+                ..LetterParts::default()
+            };
+        };
+        let sender = sender.as_str().into_owned();
+        match MessageView::parse_payload(letter.payload()) {
+            Ok(message) => LetterParts {
+                is_stamped: view.stamps().next().is_some(),
+                ..self.parts_of(&message, sender)
+            },
+            Err(error) => LetterParts {
+                fault: Some(format!("its message cannot be decoded: {error}")),
+                sender,
+                ..LetterParts::default()
+            },
+        }
+    }
+
+    fn admits(
+        &self,
+        now: Instant,
+        receiver: &str,
+        letter: &LetterParts,
+        link: Link,
+    ) -> Result<(), String> {
+        if let Of::Gateway(own) = &self.of
+            && receiver == &**own
+        {
+            return Ok(());
+        }
+        let judged = self.judge(now, receiver, letter, link);
+        judged.map_err(|why| {
+            let sender = &*letter.sender;
+            log_limit::warn!(target: AUDIT, of: link.source, sender, receiver, "letter refused: {why}");
+            why.to_string()
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_acl::{
+        AclRepresentation, AgentId, Envelope, EnvelopeParams, Message, Performative, Received, Time,
+    };
+    use fipa_mts::Source;
+    use fipa_sds::{HostConfig, Mts, Registration};
+    use fipa_transport::{Incarnation, Kind};
+
+    use super::*;
+    use crate::config;
+
+    /// Creates a letter to `arm`. Its envelope names `sender` and its message names `signed` as the
+    /// sender. If `is_stamped`, it has the stamp of a gateway.
+    fn letter(sender: &str, signed: &str, is_stamped: bool) -> Letter {
+        let [arm, sender, signed] = ["arm", sender, signed].map(|name| AgentId::new(name).unwrap());
+        let date: Time = "20261121T120000000Z".parse().unwrap();
+        let base = EnvelopeParams {
+            to: vec![arm.clone()],
+            from: Some(sender),
+            acl_representation: Some(AclRepresentation::BitEfficient),
+            date: Some(date),
+            ..EnvelopeParams::default()
+        };
+        let stamp = EnvelopeParams {
+            received: Some(Received::new("mts", date)),
+            ..EnvelopeParams::default()
+        };
+        let extensions = is_stamped.then_some(stamp).into_iter().collect();
+        let envelope = Envelope { base, extensions };
+        let message = Message::builder(Performative::Inform).sender(signed);
+        let message = message.receiver(arm).build().unwrap();
+        Letter::new(envelope.encode_standard().unwrap(), message.to_payload())
+    }
+
+    /// Returns the gate of a process, the directory of the gateway of its host, and the temporary
+    /// directory of both. The gate accepts one letter per second from each sender, and none from
+    /// the denied senders.
+    fn gate(denied: &[&str]) -> (RulesGate, HostDirectory, tempfile::TempDir) {
+        let place = tempfile::tempdir().unwrap();
+        let open = |gateway| {
+            let directory = HostDirectory::open(HostConfig {
+                brief: false,
+                dir: place.path().join("domain"),
+                mts: Mts::new("mts", Incarnation::random()),
+                gateway,
+            });
+            directory.unwrap()
+        };
+        let deny = denied.iter().map(|sender| config::AccessRule {
+            sender: (*sender).to_owned(),
+            receivers: vec![".*".to_owned()],
+        });
+        let rules = config::Access {
+            rate: 1,
+            deny: deny.collect(),
+            ..config::Access::default()
+        };
+        let access = rules.rules().unwrap().unwrap();
+        let gate = RulesGate::new(access, Of::Process(Arc::new(open(false))));
+        (gate, open(true), place)
+    }
+
+    const GATEWAY: Incarnation = Incarnation::from_u64(0x6a7e);
+
+    /// Returns the source of the letters of a service on this host.
+    fn source_by(via: Kind, service: Incarnation) -> Source {
+        match via.is_host_local() {
+            true => Source::Process(service),
+            false => Source::at(std::net::Ipv4Addr::LOCALHOST.into()),
+        }
+    }
+
+    /// Creates a link with the gateway.
+    fn gateway_by(via: Kind) -> Link {
+        Link {
+            via,
+            service: GATEWAY,
+            source: source_by(via, GATEWAY),
+        }
+    }
+
+    /// Creates a link with a process that is not the gateway.
+    fn process_by(via: Kind) -> Link {
+        let service = Incarnation::from_u64(0x9);
+        Link {
+            via,
+            service,
+            source: source_by(via, service),
+        }
+    }
+
+    /// Registers the gateway, and refreshes the directory of the process with this gate.
+    fn register(gateway: &HostDirectory, gate: &RulesGate) {
+        let at = "shm://0000000000006a7e#0000000000006a7e".parse().unwrap();
+        let registration = Registration {
+            role: EntryRole::Gateway,
+            ..Registration::new("mts", GATEWAY, vec![at])
+        };
+        gateway.register(registration).unwrap();
+        if let Of::Process(host) = &gate.of {
+            host.refresh();
+        }
+    }
+
+    fn admits(gate: &RulesGate, now: Instant, letter: &Letter, link: Link) -> Result<(), String> {
+        gate.admits(now, "arm", &gate.read(letter), link)
+    }
+
+    #[tokio::test]
+    async fn what_the_gateway_has_counted_is_not_counted_again() {
+        let (gate, gateway, _place) = gate(&[]);
+        register(&gateway, &gate);
+        let now = Instant::now();
+        let taken = |is_stamped, link| {
+            let letter = letter("rover", "rover", is_stamped);
+            admits(&gate, now, &letter, link).is_ok()
+        };
+        let link = gateway_by(Kind::Unix);
+        // Delayed letters may arrive closer together than they were sent.
+        assert!(taken(true, link) && taken(true, link) && taken(true, link));
+        assert!(taken(false, link));
+        assert!(!taken(false, link), "one a second");
+    }
+
+    #[tokio::test]
+    async fn a_stamp_evades_the_rate_on_no_link_but_the_gateways() {
+        for link in [
+            process_by(Kind::Shm),
+            process_by(Kind::Unix),
+            // Over TCP the incarnation is only a claim of the peer.
+            gateway_by(Kind::Tcp),
+        ] {
+            let (gate, gateway, _place) = gate(&[]);
+            register(&gateway, &gate);
+            let now = Instant::now();
+            let stamped = letter("rover", "rover", true);
+            assert!(admits(&gate, now, &stamped, link).is_ok());
+            assert!(admits(&gate, now, &stamped, link).is_err(), "{link:?}");
+        }
+    }
+
+    #[tokio::test]
+    async fn envelope_and_message_name_one_sender() {
+        let (gate, _gateway, _place) = gate(&[]);
+        let letter = letter("rover", "crex", false);
+        let judged = admits(&gate, Instant::now(), &letter, process_by(Kind::Shm));
+        let told = judged.unwrap_err();
+        assert!(told.contains("rover") && told.contains("crex"), "{told}");
+    }
+
+    #[tokio::test]
+    async fn the_gateway_of_the_host_is_taken_by_its_link_and_nothing_else_by_its_name() {
+        let (gate, gateway, _place) = gate(&["mts", "rover"]);
+        register(&gateway, &gate);
+        let taken = |sender, is_passed_on, link| {
+            let letter = letter(sender, sender, is_passed_on);
+            admits(&gate, Instant::now(), &letter, link).is_ok()
+        };
+        for local in [Kind::Shm, Kind::Unix] {
+            assert!(taken("mts", false, gateway_by(local)));
+            assert!(!taken("mts", true, gateway_by(local)), "from another host");
+            assert!(!taken("rover", false, gateway_by(local)));
+            assert!(!taken("mts", false, process_by(local)), "by its name");
+        }
+        assert!(!taken("mts", false, gateway_by(Kind::Tcp)), "unproved");
+    }
+}

@@ -1,0 +1,9 @@
+//! Administration of a domain: what its processes and gateways do, and what is wrong with them.
+
+pub mod contact;
+pub mod doctor;
+#[cfg(feature = "secure")]
+pub mod keys;
+pub mod open_files;
+pub mod routes;
+pub mod watch;

@@ -1,0 +1,84 @@
+//! The part of an agent's locks that the agent itself needs: their end, and which messages are theirs.
+//! The locks are in `locks`.
+
+use std::any::Any;
+use std::sync::{Arc, Weak};
+
+use fipa_acl::Message;
+use fipa_locking::{Kind, Options, codec};
+use parking_lot::Mutex;
+
+use crate::agent::incoming::Incoming;
+
+/// Protocol of questions to owners about their resources.
+pub(crate) const STATUS_PROTOCOL: &str = "fipa-locks";
+
+/// Whether a message is one of locks, which the application never reads.
+pub(crate) fn is_of_locks(message: &Message) -> bool {
+    message.protocol().is_some_and(is_lock_protocol)
+}
+
+/// Whether a received message is one of locks; does not decode it.
+pub(crate) fn is_for_locks(incoming: &Incoming) -> bool {
+    let protocol = incoming.protocol();
+    protocol.is_some_and(|name| is_lock_protocol(&name.as_str()))
+}
+
+fn is_lock_protocol(name: &str) -> bool {
+    name == STATUS_PROTOCOL || codec::is_lock_protocol(name)
+}
+
+/// The agents of this membership whose locks run. They know each other without letters.
+#[derive(Default)]
+pub(crate) struct Neighbors(Mutex<Vec<Weak<dyn Any + Send + Sync>>>);
+
+impl Neighbors {
+    /// Adds an agent, and returns those that were added before it and have not ended. Their type is that of the
+    /// module `agent`.
+    pub(crate) fn add(
+        &self,
+        agent: Weak<dyn Any + Send + Sync>,
+    ) -> Vec<Arc<dyn Any + Send + Sync>> {
+        let mut agents = self.0.lock();
+        agents.retain(|agent| agent.strong_count() > 0);
+        let before = agents.iter().filter_map(Weak::upgrade).collect();
+        agents.push(agent);
+        before
+    }
+}
+
+/// The locks of an agent, from its first call that needs them.
+#[derive(Default)]
+pub(crate) struct LockSlot(pub(crate) Mutex<Slot>);
+
+#[derive(Default)]
+pub(crate) struct Slot {
+    /// The options, unless they are the defaults.
+    pub(crate) options: Option<(Kind, Options)>,
+    /// Whether legacy peers are asked whether they use locks.
+    pub(crate) legacy_peers: bool,
+    pub(crate) running: Option<Running>,
+    pub(crate) is_closed: bool,
+}
+
+/// Running locks.
+pub(crate) struct Running {
+    /// The state, whose type is that of the module `locks`.
+    pub(crate) shared: Arc<dyn Any + Send + Sync>,
+    /// Releases all locks.
+    pub(crate) close: Box<dyn FnOnce() + Send>,
+}
+
+impl LockSlot {
+    /// Ends the locks, before the agent is deregistered.
+    pub(crate) fn close(&self) {
+        let running = {
+            let mut slot = self.0.lock();
+            slot.is_closed = true;
+            slot.running.take()
+        };
+        if let Some(running) = running {
+            (running.close)();
+        }
+    }
+}

@@ -1,0 +1,734 @@
+//! Assembles a message transport service: the transports of the configuration, the agent directory
+//! of the host, and the runtime over both.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa_acl::ErrorChain;
+use fipa_mts::core::CoreConfig;
+use fipa_mts::{AccessGate, Contacts, Mts, RuntimeConfig, Started};
+use fipa_sds::{Cancellation, Directory, Entry, HostDirectory, Pattern};
+use fipa_transport::{Incarnation, Kind, Location, Signature, Transport, log_limit};
+use tokio::runtime::Handle;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+use crate::Config;
+use crate::access::gate::{Of, RulesGate};
+use crate::admin::open_files;
+use crate::admin::routes::Report;
+use crate::admin::watch::Watchers;
+use crate::domain::files::DomainDir;
+use crate::domain::maintenance::DirMaintenance;
+use crate::domain::membership::{self, Membership};
+use crate::error::OpenError;
+
+/// Interval of keep-alive messages on an idle connection. A broken connection, for example after a
+/// change of address, is detected after twice this time, which must be less than the default deadline
+/// of a letter.
+const KEEP_ALIVE: Duration = Duration::from_secs(2);
+
+/// Time that a closing service waits for letters in transit.
+pub(crate) const CLOSING_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// A message transport service in one of its two roles.
+pub(crate) struct Service {
+    pub(crate) mts: Mts,
+    pub(crate) host: Arc<HostDirectory>,
+    /// The current locations of the service.
+    locations: watch::Receiver<Arc<[Location]>>,
+    pub(crate) name: Arc<str>,
+    /// The service in the directory.
+    pub(crate) own: fipa_sds::Mts,
+    pub(crate) dir: DomainDir,
+    /// The task that serves the watchers.
+    watching: JoinHandle<()>,
+    maintenance: JoinHandle<()>,
+    /// The runtime of the background tasks.
+    pub(crate) runtime: Handle,
+}
+
+/// The differences between a robot process and the gateway.
+pub(crate) struct Role<'a> {
+    /// The name of the service.
+    pub(crate) name: Arc<str>,
+    /// Whether the service is the gateway, which forwards letters.
+    pub(crate) gateway: bool,
+    /// Whether the process is likely to end within a second.
+    pub(crate) brief: bool,
+    /// The recipient of notifications about agents of other hosts that have sent letters.
+    pub(crate) contacts: Option<Arc<dyn Contacts>>,
+    /// The proofs of identity that peers must give.
+    #[cfg(feature = "secure")]
+    pub(crate) security: Option<fipa_transport_net::secure::Security>,
+    /// Receives the TCP connections that are refused because of keys.
+    #[cfg(feature = "net")]
+    pub(crate) refusals: fipa_transport_net::Refusals,
+    /// Receives the connections of this side that peers refuse.
+    #[cfg(feature = "net")]
+    pub(crate) refused_dials: fipa_transport_net::RefusedDials,
+    /// Creates the view of the directory in which receivers are looked up.
+    pub(crate) view: &'a View<'a>,
+}
+
+/// Returns at most as many of these locations as an entry can have, in the same order. Each kind keeps its
+/// first ones: a host with many addresses is still reached over each of its transports.
+fn best(locations: Vec<Location>) -> Vec<Location> {
+    let mut counts: BTreeMap<Kind, usize> = BTreeMap::new();
+    let ranks = locations.iter().map(|location| {
+        let count = counts.entry(location.kind()).or_default();
+        *count += 1;
+        *count
+    });
+    let mut ranked: Vec<(usize, usize)> = ranks.zip(0..).collect();
+    ranked.sort_unstable();
+    ranked.truncate(Entry::MAX_LOCATIONS);
+    let kept = |place: &usize| ranked.iter().any(|(_, it)| it == place);
+    let places = 0..locations.len();
+    let kept: Vec<bool> = places.map(|place| kept(&place)).collect();
+    let all = locations.into_iter().zip(kept);
+    all.filter_map(|(location, kept)| kept.then_some(location))
+        .collect()
+}
+
+/// Creates a view from the directory of this host and the service that looks up receivers.
+pub(crate) type View<'a> =
+    dyn Fn(Arc<HostDirectory>, &fipa_sds::Mts) -> Result<Arc<dyn Directory>, OpenError> + 'a;
+
+impl Service {
+    /// Starts the service. Waits for other processes, so it must be called on a thread for blocking
+    /// calls.
+    pub(crate) fn start(
+        config: &Config,
+        role: Role<'_>,
+        cancellation: &Cancellation,
+    ) -> Result<Self, OpenError> {
+        if config.mts.raise_open_files
+            && let Err(error) = open_files::raise()
+        {
+            log_limit::warn!(%error, "cannot raise the limit of open files");
+        }
+        config.check()?;
+        let handle = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
+        let incarnation = Incarnation::random();
+        let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
+        let membership = Membership {
+            gateway: role.gateway,
+            brief: role.brief,
+        };
+        let (dir, host) = membership::join(&config.domain, &own, membership, cancellation)?;
+        let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| dir.leave())?;
+        let gate = gate(config, &role, &host).inspect_err(|_| dir.leave())?;
+        let watchers = Arc::new(Watchers::new(&own, role.gateway));
+        let mut refused = Vec::new();
+        let mut maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host));
+        let transports = transports(
+            config,
+            &role,
+            &mut maintenance,
+            incarnation,
+            &handle,
+            &mut refused,
+        );
+        let Started { mts, failed, .. } = Mts::start(
+            core_config(config, &role, incarnation),
+            RuntimeConfig {
+                spin: config.transport.shm.spin,
+                unframed_deadline: config.mts.deadline,
+                contacts: role.contacts.clone(),
+                tap: Some(Arc::clone(&watchers) as Arc<dyn fipa_mts::Tap>),
+                gate,
+            },
+            view,
+            transports,
+            &handle,
+        );
+        let connected = watchers.connect_all(&host, &mts);
+        let watching = handle.spawn(watchers.run(Arc::clone(&host), mts.clone(), connected));
+        let service = Self {
+            watching,
+            locations: mts.locations(),
+            maintenance: handle.spawn(maintenance.run()),
+            mts,
+            host,
+            name: role.name,
+            own,
+            dir,
+            runtime: handle,
+        };
+        for (kind, error) in failed {
+            // A gateway needs all its network transports; within the host another one may do.
+            if role.gateway && !kind.is_host_local() {
+                service.abort();
+                return Err(OpenError::Listen {
+                    kind,
+                    source: error,
+                });
+            }
+            refused.push((kind, ErrorChain(&error).to_string()));
+        }
+        if service.locations().is_empty() {
+            service.abort();
+            return Err(OpenError::NoTransport(reasons(config, &refused)));
+        }
+        // A transport does not know that its directory is the cause.
+        let cause = match refused.is_empty() {
+            true => None,
+            false => service.dir.check_writable().err(),
+        };
+        let cause = cause.map(|cause| ErrorChain(&cause).to_string());
+        for (kind, error) in &refused {
+            let error = cause
+                .as_ref()
+                .filter(|_| kind.is_host_local())
+                .unwrap_or(error);
+            log_limit::warn!(%kind, error, "a transport cannot be used; continuing without it");
+        }
+        Ok(service)
+    }
+
+    /// Returns the name of the domain.
+    #[cfg(feature = "locks")]
+    pub(crate) fn domain_name(&self) -> &str {
+        self.dir.name()
+    }
+
+    /// Returns the current locations of the service.
+    #[cfg(feature = "net")]
+    pub(crate) fn all_locations(&self) -> Vec<Location> {
+        self.locations.borrow().to_vec()
+    }
+
+    /// Returns the current locations of the service as they are shown to people and to other platforms: each address
+    /// of a transport once, those for platforms such as JADE with their path.
+    #[cfg(feature = "net")]
+    pub(crate) fn shown_locations(&self) -> Vec<Location> {
+        let framed = self.locations();
+        let locations = self.locations.borrow();
+        let others = locations.iter().filter(|location| {
+            let same = |framed: &Location| {
+                framed.kind() == location.kind() && framed.address() == location.address()
+            };
+            location.signature() != Signature::Frames && !framed.iter().any(same)
+        });
+        let mut all = framed.clone();
+        for location in others.map(with_path) {
+            if !all.contains(&location) {
+                all.push(location);
+            }
+        }
+        all
+    }
+
+    /// Returns the current locations of the service for directories, at most as many as an entry can
+    /// have. The locations for legacy peers only are left out: services that confirm deliveries must
+    /// not use them.
+    pub(crate) fn locations(&self) -> Vec<Location> {
+        let locations = self.locations.borrow();
+        let framed = locations.iter();
+        let framed = framed.filter(|location| location.signature() == Signature::Frames);
+        best(framed.cloned().collect())
+    }
+
+    /// Returns a receiver that is notified of changes of the locations.
+    #[cfg(feature = "net")]
+    pub(crate) fn follow_locations(&self) -> watch::Receiver<Arc<[Location]>> {
+        self.locations.clone()
+    }
+
+    /// Reports the routes that letters to these agents would take now.
+    pub(crate) fn report(&self, to: &[Arc<Entry>]) -> Report {
+        Report {
+            mts: self.name.to_string(),
+            incarnation: self.own.incarnation,
+            locations: self.locations(),
+            routes: self.mts.routes(to),
+            ways: self.mts.ways(),
+            peers: self.mts.peers().into_iter().map(Into::into).collect(),
+            neighbors: Vec::new(),
+            refused: Vec::new(),
+            refused_dials: Vec::new(),
+            contested: Vec::new(),
+            namesakes: Vec::new(),
+            configuration: BTreeMap::new(),
+        }
+    }
+
+    /// Whether this service has a transport of this kind.
+    #[cfg(feature = "net")]
+    pub(crate) fn uses(&self, kind: Kind) -> bool {
+        self.mts.kinds().any(|open| open == kind)
+    }
+
+    /// Applies the orders of transports and the deadline of this configuration. For the gateway only.
+    #[cfg(feature = "net")]
+    pub(crate) fn reorder(&self, config: &Config) {
+        let mut order = config.mts.transports.clone();
+        let open: Vec<Kind> = self.mts.kinds().collect();
+        order.retain(|kind| open.contains(kind));
+        let routes = routes(config, &order, true);
+        self.mts.reorder(order, routes, config.mts.deadline);
+    }
+
+    /// Waits for letters in transit, at most [`CLOSING_TIMEOUT`], and ends the service.
+    pub(crate) async fn close(&self) {
+        self.mts.close(CLOSING_TIMEOUT).await;
+        log_limit::report_omitted();
+        self.abort();
+    }
+
+    /// Ends the service at once and removes its files.
+    pub(crate) fn abort(&self) {
+        self.watching.abort();
+        self.maintenance.abort();
+        self.mts.abort();
+        if let Err(error) = self.host.close() {
+            log_limit::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");
+        }
+        self.dir.leave();
+    }
+}
+
+/// Returns a location of HTTP with the path at which platforms write to a gateway.
+#[cfg(feature = "net")]
+fn with_path(location: &Location) -> Location {
+    let is_http = matches!(location.kind(), Kind::Http | Kind::Https);
+    let has_path = location.address().contains('/');
+    if !is_http || has_path {
+        return location.clone();
+    }
+    let address = format!("{}/acc", location.address());
+    let with = Location::new(location.kind(), &address);
+    let with = with.and_then(|with| with.with_signature(location.signature()));
+    with.map_or_else(
+        |_| location.clone(),
+        |with| with.with_incarnation(location.incarnation()),
+    )
+}
+
+/// Creates the access gate, if the configuration has access rules.
+fn gate(
+    config: &Config,
+    role: &Role<'_>,
+    host: &Arc<HostDirectory>,
+) -> Result<Option<Arc<dyn AccessGate>>, OpenError> {
+    let of = match role.gateway {
+        true => Of::Gateway(Arc::clone(&role.name)),
+        false => Of::Process(Arc::clone(host)),
+    };
+    // Cannot fail, because the check of the configuration has parsed the rules.
+    let access = config.access.rules().map_err(OpenError::Access)?;
+    Ok(access.map(|access| Arc::new(RulesGate::new(access, of)) as Arc<dyn AccessGate>))
+}
+
+/// Joins the reasons why no transport can be used.
+fn reasons(config: &Config, refused: &[(Kind, String)]) -> String {
+    let refused = refused.iter();
+    let mut texts: Vec<String> = refused
+        .map(|(kind, error)| format!("{kind}: {error}"))
+        .collect();
+    if !config.mts.transports.iter().any(|it| it.is_host_local()) {
+        let unused = "mts.transports has none for processes of one host: list shm or unix, or set \
+                      transport.tcp.processes = true to use tcp";
+        texts.push(unused.to_owned());
+    }
+    texts.join("; ")
+}
+
+fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> CoreConfig {
+    let order: Vec<Kind> = used(config, role).collect();
+    CoreConfig {
+        forwards: role.gateway,
+        routes: routes(config, &order, role.gateway),
+        queue: config.mts.queue,
+        queue_bytes: usize::try_from(config.mts.queue_bytes).unwrap_or(usize::MAX),
+        lane_bytes: usize::try_from(config.mts.queue_bytes).unwrap_or(usize::MAX),
+        contact_networks: config.contacts.networks.clone(),
+        ..CoreConfig::new(Arc::clone(&role.name), incarnation, order)
+    }
+}
+
+/// Returns `[routes]` of the configuration, restricted to the transports in use. Lines that list only
+/// transports between hosts apply to the gateway.
+fn routes(config: &Config, order: &[Kind], gateway: bool) -> Vec<(Pattern, Vec<Kind>)> {
+    let routes = config.routes.iter().filter_map(|route| {
+        // Always compiles, because the check of the configuration has compiled it.
+        let pattern = Pattern::new(&route.receiver).ok()?;
+        let used = route.transports.iter().copied();
+        let used: Vec<Kind> = used.filter(|kind| order.contains(kind)).collect();
+        let names_local = route.transports.iter().any(|kind| kind.is_host_local());
+        (gateway || names_local || !used.is_empty()).then_some((pattern, used))
+    });
+    routes.collect()
+}
+
+/// Returns the kinds of transport for this role, in order of preference. One configuration serves the
+/// gateway and all other processes of a host. Only the gateway uses the network, unless
+/// `transport.tcp.processes` turns on TCP within the host.
+fn used<'a>(config: &'a Config, role: &Role<'_>) -> impl Iterator<Item = Kind> + use<'a> {
+    let gateway = role.gateway;
+    let kinds = config.mts.transports.iter().copied();
+    kinds.filter(move |kind| {
+        let tcp = *kind == Kind::Tcp && config.transport.tcp.processes;
+        gateway || kind.is_host_local() || tcp
+    })
+}
+
+/// Creates the transports for this role that are built in. Adds the reason of each failure to
+/// `refused`.
+fn transports(
+    config: &Config,
+    role: &Role<'_>,
+    maintenance: &mut DirMaintenance,
+    incarnation: Incarnation,
+    handle: &Handle,
+    refused: &mut Vec<(Kind, String)>,
+) -> Vec<Arc<dyn Transport>> {
+    let mut transports: Vec<Arc<dyn Transport>> = Vec::new();
+    for kind in used(config, role) {
+        let made = match kind {
+            #[cfg(feature = "shm")]
+            Kind::Shm => shm(config, role, maintenance, incarnation, handle),
+            Kind::Unix => unix(config, role, maintenance, incarnation, handle),
+            #[cfg(feature = "net")]
+            Kind::Tcp => tcp(config, role, &maintenance.dir, incarnation, handle),
+            #[cfg(feature = "net")]
+            Kind::Udp => udp(config, role, &maintenance.dir, incarnation, handle),
+            #[cfg(feature = "quic")]
+            Kind::Quic => match &role.security {
+                Some(security) => quic(
+                    config,
+                    role,
+                    security,
+                    &maintenance.dir,
+                    incarnation,
+                    handle,
+                ),
+                // Cannot happen: the check of the configuration demands keys for QUIC.
+                None => continue,
+            },
+            #[cfg(feature = "http")]
+            Kind::Http => http(config, role, &maintenance.dir, incarnation, handle),
+            #[cfg(all(feature = "http", feature = "secure"))]
+            Kind::Https => https(config, role, &maintenance.dir, incarnation, handle),
+            #[cfg(feature = "udt")]
+            Kind::Udt => udt(config, role, &maintenance.dir, incarnation, handle),
+            // One configuration serves all processes of a robot; their features may differ.
+            other => {
+                tracing::debug!(kind = %other, "this program was built without a transport");
+                continue;
+            }
+        };
+        match made {
+            Ok(transport) => transports.push(transport),
+            Err(error) => refused.push((kind, error)),
+        }
+    }
+    transports
+}
+
+#[cfg(feature = "shm")]
+fn shm(
+    config: &Config,
+    role: &Role<'_>,
+    maintenance: &mut DirMaintenance,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_shm::{ShmConfig, ShmTransport};
+    let settings = &config.transport.shm;
+    let config = ShmConfig {
+        capacity: settings.capacity,
+        max_letter: usize::try_from(settings.max_letter).unwrap_or(usize::MAX),
+        answers_late: role.gateway,
+        ..ShmConfig::new(
+            maintenance.dir.part("shm"),
+            maintenance.dir.prefix(),
+            incarnation,
+        )
+    };
+    let transport = ShmTransport::new(config, handle.clone());
+    let transport = transport.map_err(|error| ErrorChain(&error).to_string())?;
+    let transport = Arc::new(transport);
+    maintenance.shm = Some(Arc::downgrade(&transport));
+    tidy(handle, maintenance, &transport, ShmTransport::tidy);
+    Ok(transport)
+}
+
+fn unix(
+    config: &Config,
+    role: &Role<'_>,
+    maintenance: &mut DirMaintenance,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{UnixConfig, UnixTransport};
+    let config = UnixConfig {
+        directory: maintenance.dir.part("unix"),
+        identity: identity(config, role, &maintenance.dir, incarnation)?,
+        limits: stream_limits(config),
+    };
+    let transport = Arc::new(UnixTransport::new(config, handle.clone()));
+    maintenance.unix = Some(Arc::downgrade(&transport));
+    tidy(handle, maintenance, &transport, UnixTransport::tidy);
+    Ok(transport)
+}
+
+/// Starts a task that removes a transport's leftovers of processes that have ended. The directory
+/// detects the end of every process, a transport only of those that it has connections with.
+fn tidy<T: Transport>(
+    handle: &Handle,
+    maintenance: &DirMaintenance,
+    transport: &Arc<T>,
+    tidy: impl Fn(&T) + Send + 'static,
+) {
+    let (mut departures, weak) = (maintenance.host.departures(), Arc::downgrade(transport));
+    handle.spawn(async move {
+        while departures.next().await {
+            match weak.upgrade() {
+                Some(transport) => tidy(&transport),
+                None => return,
+            }
+        }
+    });
+}
+
+#[cfg(feature = "net")]
+fn tcp(
+    config: &Config,
+    role: &Role<'_>,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{TcpConfig, TcpTransport};
+    let mut tcp = TcpConfig::new(
+        listen(&config.transport.tcp.listen, role),
+        identity(config, role, dir, incarnation)?,
+    );
+    tcp.limits = stream_limits(config);
+    tcp.processes = config.transport.tcp.processes;
+    tcp.refusals = role.refusals.clone();
+    tcp.refused_dials = role.refused_dials.clone();
+    #[cfg(feature = "secure")]
+    {
+        tcp.security = role.security.clone();
+    }
+    Ok(Arc::new(TcpTransport::new(tcp, handle.clone())))
+}
+
+#[cfg(feature = "net")]
+fn udp(
+    config: &Config,
+    role: &Role<'_>,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{UdpConfig, UdpTransport};
+    let config = UdpConfig {
+        listen: config.transport.udp.listen.clone(),
+        identity: identity(config, role, dir, incarnation)?,
+        limits: datagram_limits(config),
+    };
+    Ok(Arc::new(UdpTransport::new(config, handle.clone())))
+}
+
+#[cfg(feature = "quic")]
+fn quic(
+    config: &Config,
+    role: &Role<'_>,
+    security: &fipa_transport_net::secure::Security,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{QuicConfig, QuicTransport};
+    let config = QuicConfig {
+        listen: config.transport.quic.listen.clone(),
+        identity: identity(config, role, dir, incarnation)?,
+        limits: stream_limits(config),
+        refused_dials: role.refused_dials.clone(),
+        security: security.clone(),
+        refusals: role.refusals.clone(),
+    };
+    Ok(Arc::new(QuicTransport::new(config, handle.clone())))
+}
+
+#[cfg(feature = "http")]
+fn http(
+    config: &Config,
+    role: &Role<'_>,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{HttpConfig, HttpTransport};
+    let config = HttpConfig {
+        listen: config.transport.http.listen.clone(),
+        identity: identity(config, role, dir, incarnation)?,
+        limits: stream_limits(config),
+        #[cfg(feature = "secure")]
+        security: role.security.clone(),
+    };
+    Ok(Arc::new(HttpTransport::new(config, handle.clone())))
+}
+
+#[cfg(all(feature = "http", feature = "secure"))]
+fn https(
+    config: &Config,
+    role: &Role<'_>,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{HttpConfig, HttpTransport};
+    let Some(security) = &role.security else {
+        return Err("https needs keys (security.keys)".to_owned());
+    };
+    let settings = &config.transport.https;
+    let authorities = crate::admin::keys::authorities(settings.authorities.as_ref());
+    let authorities = authorities.map_err(|error| ErrorChain(&error).to_string())?;
+    let set = security.set_authorities(authorities);
+    set.map_err(|error| ErrorChain(&error).to_string())?;
+    let config = HttpConfig {
+        listen: settings.listen.clone(),
+        identity: identity(config, role, dir, incarnation)?,
+        limits: stream_limits(config),
+        security: Some(security.clone()),
+    };
+    let transport = HttpTransport::over_tls(config, security.clone(), handle.clone());
+    Ok(Arc::new(transport))
+}
+
+#[cfg(feature = "udt")]
+fn udt(
+    config: &Config,
+    role: &Role<'_>,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{UdtConfig, UdtTransport};
+    let config = UdtConfig {
+        listen: config.transport.udt.listen.clone(),
+        identity: identity(config, role, dir, incarnation)?,
+        limits: udt_limits(config),
+        #[cfg(feature = "secure")]
+        security: role.security.clone(),
+    };
+    Ok(Arc::new(UdtTransport::new(config, handle.clone())))
+}
+
+/// Returns the limits of UDT, whose largest letter is that of its peers.
+#[cfg(feature = "udt")]
+fn udt_limits(config: &Config) -> fipa_transport_net::UdtLimits {
+    fipa_transport_net::UdtLimits {
+        max_per_address: config.security.peer_connections,
+        peer_letters: config.security.peer_letters as u64,
+        peer_bytes: config.security.peer_bytes,
+        ..fipa_transport_net::UdtLimits::default()
+    }
+}
+
+/// Returns the limits of the transports that carry letters of any size.
+fn stream_limits(config: &Config) -> fipa_transport_net::Limits {
+    fipa_transport_net::Limits {
+        max_letter: usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX),
+        keep_alive: KEEP_ALIVE,
+        max_per_address: config.security.peer_connections,
+        peer_letters: config.security.peer_letters as u64,
+        peer_bytes: config.security.peer_bytes,
+        ..fipa_transport_net::Limits::default()
+    }
+}
+
+/// Returns the limits of UDP, whose letters fit datagrams.
+#[cfg(feature = "net")]
+fn datagram_limits(config: &Config) -> fipa_transport_net::UdpLimits {
+    fipa_transport_net::UdpLimits {
+        max_per_address: config.security.peer_connections,
+        peer_letters: config.security.peer_letters as u64,
+        peer_bytes: config.security.peer_bytes,
+        ..fipa_transport_net::UdpLimits::default()
+    }
+}
+
+/// Returns the addresses to listen on: those of the configuration for the gateway, loopback for other
+/// processes.
+#[cfg(feature = "net")]
+fn listen(addresses: &[String], role: &Role<'_>) -> Vec<String> {
+    if role.gateway {
+        addresses.to_vec()
+    } else {
+        vec!["127.0.0.1:0".to_owned()]
+    }
+}
+
+fn identity(
+    config: &Config,
+    role: &Role<'_>,
+    dir: &DomainDir,
+    incarnation: Incarnation,
+) -> Result<fipa_transport_net::Identity, String> {
+    Ok(fipa_transport_net::Identity {
+        name: role.name.to_string(),
+        incarnation,
+        domain: config.domain.clone(),
+        host: dir
+            .host_id()
+            .map_err(|error| format!("cannot identify this host: {}", ErrorChain(&error)))?,
+    })
+}
+
+#[cfg(all(test, feature = "net"))]
+mod tests {
+    use super::*;
+    use crate::config::Sources;
+
+    #[test]
+    fn a_host_with_many_addresses_keeps_each_of_its_transports() {
+        let tcp = (1..=20).map(|last| format!("tcp://10.0.0.{last}:1"));
+        let others = ["udp://10.0.0.1:1", "quic://10.0.0.1:1"].map(str::to_owned);
+        let all: Vec<Location> = tcp.chain(others).map(|it| it.parse().unwrap()).collect();
+        let best = best(all.clone());
+        assert_eq!(best.len(), Entry::MAX_LOCATIONS);
+        let first = Entry::MAX_LOCATIONS - 2;
+        assert_eq!(best[..first], all[..first]);
+        assert_eq!(best[first..], all[20..]);
+        assert_eq!(super::best(all[..3].to_vec()), all[..3]);
+    }
+
+    #[test]
+    fn limits_per_peer_of_the_configuration_apply_to_every_transport() {
+        let set = ["connections=3", "letters=5", "bytes=70KiB"];
+        let sources = Sources {
+            set: set.map(|it| format!("security.peer_{it}")).into(),
+            ..Sources::default()
+        };
+        let config = Config::load(&sources).unwrap();
+        let stream = stream_limits(&config);
+        let datagram = datagram_limits(&config);
+        #[cfg(feature = "udt")]
+        {
+            let udt = udt_limits(&config);
+            let limits = (udt.max_per_address, udt.peer_letters, udt.peer_bytes);
+            assert_eq!(limits, (3, 5, 70 << 10));
+        }
+        for (connections, letters, bytes) in [
+            (
+                stream.max_per_address,
+                stream.peer_letters,
+                stream.peer_bytes,
+            ),
+            (
+                datagram.max_per_address,
+                datagram.peer_letters,
+                datagram.peer_bytes,
+            ),
+        ] {
+            assert_eq!((connections, letters, bytes), (3, 5, 70 << 10));
+        }
+    }
+}
