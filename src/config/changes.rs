@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use super::Config;
+use super::keys::dotted;
 use super::keys::{KEYS, MAPS};
-use super::reader::dotted;
 
 impl Config {
     /// Returns the keys whose values differ, as they are written with `--set`.

@@ -11,8 +11,8 @@ use fipa_sds::{Pattern, check_name, reserved_for};
 use fipa_transport::wire::MAX_REMAINING;
 use fipa_transport::{Kind, Location};
 
+use super::keys::dotted;
 use super::keys::{is_interface_name, is_numeric_address};
-use super::reader::dotted;
 use super::{
     Access, Config, Interface, Mistake, Origin, Peer, Platform, PlatformAgent, Route, Shm,
 };

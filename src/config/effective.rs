@@ -1,14 +1,13 @@
 //! The configuration with the origin of every value.
 
 use std::collections::BTreeMap;
-use std::fmt::{Display, Write};
+use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use toml_edit::Value as Toml;
 
-use super::keys::{KEYS, MAPS};
-use super::reader::{Reader, bare_or_quoted, dotted};
+use super::keys::{KEYS, MAPS, Value, bare_or_quoted, dotted};
+use super::reader::Reader;
 use super::sources::Found;
 use super::{Config, ConfigError, Origin, Sources, machine};
 
@@ -30,21 +29,6 @@ pub struct Setting {
     pub value: Value,
     /// The origin of the value.
     pub origin: Origin,
-}
-
-/// A value as it is written in the file. Sizes, durations and addresses are text.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-#[serde(untagged)]
-#[non_exhaustive]
-pub enum Value {
-    /// `true` or `false`.
-    Truth(bool),
-    /// A number without unit.
-    Number(usize),
-    /// Text.
-    Text(String),
-    /// A list of texts.
-    List(Vec<String>),
 }
 
 impl Effective {
@@ -185,24 +169,5 @@ impl Effective {
             let _ = writeln!(text, "{line:<36} # {origin}");
         }
         text
-    }
-}
-
-impl Value {
-    /// Creates a list of items that are written as text.
-    pub(super) fn list(items: &[impl Display]) -> Self {
-        Self::List(items.iter().map(ToString::to_string).collect())
-    }
-
-    pub(super) fn to_toml(&self) -> String {
-        match self {
-            Self::Truth(truth) => truth.to_string(),
-            Self::Number(number) => number.to_string(),
-            Self::Text(text) => Toml::from(text).to_string(),
-            Self::List(items) => {
-                let items: Vec<String> = items.iter().map(|i| Toml::from(i).to_string()).collect();
-                format!("[{}]", items.join(", "))
-            }
-        }
     }
 }

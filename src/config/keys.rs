@@ -3,6 +3,7 @@
 //! A new key needs a field of [`Config`], its default, and one entry here. [`super::check`] checks
 //! bounds and conditions on several keys.
 
+use std::fmt::Display;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use std::ops::Range;
 use std::str::FromStr;
@@ -10,10 +11,44 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use fipa_transport::{Kind, LocationError};
+use serde::Serialize;
 use toml_edit::Value as Toml;
 
-use super::effective::Value;
 use super::{AccessRule, Check, Config, Interface, Peer, PlatformAgent, Route};
+
+/// A value as it is written in the file. Sizes, durations and addresses are text.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[serde(untagged)]
+#[non_exhaustive]
+pub enum Value {
+    /// `true` or `false`.
+    Truth(bool),
+    /// A number without unit.
+    Number(usize),
+    /// Text.
+    Text(String),
+    /// A list of texts.
+    List(Vec<String>),
+}
+
+impl Value {
+    /// Creates a list of items that are written as text.
+    pub(super) fn list(items: &[impl Display]) -> Self {
+        Self::List(items.iter().map(ToString::to_string).collect())
+    }
+
+    pub(super) fn to_toml(&self) -> String {
+        match self {
+            Self::Truth(truth) => truth.to_string(),
+            Self::Number(number) => number.to_string(),
+            Self::Text(text) => Toml::from(text).to_string(),
+            Self::List(items) => {
+                let items: Vec<String> = items.iter().map(|i| Toml::from(i).to_string()).collect();
+                format!("[{}]", items.join(", "))
+            }
+        }
+    }
+}
 
 /// A key with a fixed path.
 pub(super) struct Key {
@@ -431,7 +466,7 @@ pub(super) fn quoted(value: &Toml) -> String {
 }
 
 impl InvalidValue {
-    fn new(value: &Toml, reason: impl std::fmt::Display) -> Self {
+    fn new(value: &Toml, reason: impl Display) -> Self {
         Self {
             span: value.span(),
             reason: format!("{}: {reason}", quoted(value)),
@@ -551,7 +586,7 @@ fn kinds(value: &Toml) -> Result<Vec<Kind>, InvalidValue> {
 /// Parses a text.
 fn parsed<T>(value: &Toml) -> Result<T, InvalidValue>
 where
-    T: FromStr<Err: std::fmt::Display>,
+    T: FromStr<Err: Display>,
 {
     let text = value
         .as_str()
@@ -633,4 +668,15 @@ fn size_text(bytes: u64) -> Value {
         Some((bits, unit)) => format!("{}{unit}", bytes >> bits),
         None => format!("{bytes}B"),
     })
+}
+
+/// Writes a path as a dotted key of TOML.
+pub(super) fn dotted(path: &[&str]) -> String {
+    let keys: Vec<String> = path.iter().map(|&part| bare_or_quoted(part)).collect();
+    keys.join(".")
+}
+
+/// Writes a key of TOML, quoted if necessary.
+pub(super) fn bare_or_quoted(key: &str) -> String {
+    toml_edit::Key::new(key).display_repr().into_owned()
 }

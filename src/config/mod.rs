@@ -89,8 +89,9 @@ use fipa_transport::{Kind, Location};
 
 #[cfg(feature = "net")]
 pub(crate) use check::is_on_loopback;
-pub use effective::{Effective, Setting, Value};
+pub use effective::{Effective, Setting};
 pub use error::{ConfigError, Mistake, Origin};
+pub use keys::Value;
 pub use sources::Sources;
 
 use crate::access::rules;

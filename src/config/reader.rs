@@ -8,7 +8,7 @@ use std::path::Path;
 
 use toml_edit::{Array, Document, Item, Value as Toml};
 
-use super::keys::{InvalidValue, KEYS, Key, MAPS, Map, Shape, present_name};
+use super::keys::{InvalidValue, KEYS, Key, MAPS, Map, Shape, dotted, present_name};
 use super::{Config, Mistake, Origin, check};
 
 /// A configuration that is being read.
@@ -310,20 +310,9 @@ fn suggestion(path: &[&str]) -> String {
     }
 }
 
-/// Writes a path as a dotted key of TOML.
-pub(super) fn dotted(path: &[&str]) -> String {
-    let keys: Vec<String> = path.iter().map(|&part| bare_or_quoted(part)).collect();
-    keys.join(".")
-}
-
 fn quoted_path(path: &[String]) -> String {
     let parts: Vec<&str> = path.iter().map(String::as_str).collect();
     dotted(&parts)
-}
-
-/// Writes a key of TOML, quoted if necessary.
-pub(super) fn bare_or_quoted(key: &str) -> String {
-    toml_edit::Key::new(key).display_repr().into_owned()
 }
 
 /// Splits an assignment at the first `=` outside of a quoted key.

@@ -9,6 +9,7 @@ pub(crate) mod membership;
 #[cfg(any(feature = "protocols", feature = "net"))]
 pub(crate) mod presence;
 pub(crate) mod process;
+pub(crate) mod report;
 pub(crate) mod service;
 pub(crate) mod user_dir;
 
@@ -21,7 +22,7 @@ use fipa_sds::{Cancellation, Entry, Query, Watch};
 use fipa_transport::log_limit;
 use tokio::runtime::Handle;
 
-use crate::admin::routes::{self, Report};
+use self::report::Report;
 use crate::agent::checks::Rules;
 use crate::agent::lock_slot;
 use crate::agent::stated::Introductions;
@@ -184,7 +185,7 @@ impl Domain {
     #[must_use]
     pub fn agents(&self) -> Vec<Arc<Entry>> {
         self.directory().refresh();
-        let mut agents = routes::agents(&*self.inner.service.host, &Query::all());
+        let mut agents = report::agents(&*self.inner.service.host, &Query::all());
         agents.retain(|entry| !entry.is_platform_agent());
         agents
     }
@@ -230,7 +231,7 @@ impl Domain {
     /// gateway; [`routes::of_gateway`](crate::admin::routes::of_gateway) reports the routes from there.
     #[must_use]
     pub fn routes(&self, to: &Query) -> Report {
-        let entries = routes::agents(&*self.inner.service.host, to);
+        let entries = report::agents(&*self.inner.service.host, to);
         self.inner.service.report(&entries)
     }
 

@@ -17,11 +17,11 @@ use tokio::task::JoinHandle;
 use crate::Config;
 use crate::access::gate::{Of, RulesGate};
 use crate::admin::open_files;
-use crate::admin::routes::Report;
 use crate::admin::watch::Watchers;
 use crate::domain::files::DomainDir;
 use crate::domain::maintenance::DirMaintenance;
 use crate::domain::membership::{self, Membership};
+use crate::domain::report::Report;
 use crate::error::OpenError;
 
 /// Interval of keep-alive messages on an idle connection. A broken connection, for example after a

@@ -15,7 +15,6 @@ mod names;
 mod namesakes;
 mod neighbors;
 mod platform_agents;
-mod presence;
 mod publish_pace;
 mod publisher;
 mod state;
@@ -44,6 +43,8 @@ use tokio::task::JoinHandle;
 
 use self::exchange::{Exchanging, Means};
 use self::gateway_agent::GatewayAgent;
+#[cfg(feature = "fuzzing")]
+pub(crate) use self::gateway_agent::questions::play as play_presence;
 #[cfg(feature = "secure")]
 use self::guard::Guard;
 use self::introductions::Takers;
@@ -51,8 +52,6 @@ use self::namesakes::Namesakes;
 pub use self::neighbors::Neighbor;
 use self::neighbors::{Neighbors, View};
 use self::platform_agents::PlatformAgents;
-#[cfg(feature = "fuzzing")]
-pub(crate) use self::presence::play as play_presence;
 use self::publisher::{PublishTask, Publisher};
 #[cfg(feature = "fuzzing")]
 pub(crate) use self::state::play as play_state;

@@ -7,7 +7,8 @@ use fipa_transport::{
     TransportErrorKind,
 };
 
-use super::{Notice, SendId};
+use super::ids::SendId;
+use super::notice::Notice;
 
 /// An action that the runtime performs for the delivery core.
 #[derive(Debug)]

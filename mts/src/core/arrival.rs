@@ -1,55 +1,20 @@
 //! Parcels that arrive, and the queues of the agents of this process.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use fipa_acl::Letter;
 use fipa_sds::{Entry, Reach, Role};
 use fipa_transport::{
-    Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Parcel, Realm, Report, Stream,
-    Ticket, Verdict,
+    Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Realm, Report, Ticket, Verdict,
 };
 
 use super::action::Action;
+use super::ids::LaneKey;
 use super::inbox::{Inbox, Received, ask};
-use super::lane::LaneKey;
+use super::label::Label;
 use super::principals::PrincipalError;
 use super::{Core, News, Now, ReadLetter, reading, work};
 use crate::gate::{LetterParts, Link};
-
-/// A parcel without its body.
-#[derive(Debug)]
-pub(super) struct Label {
-    pub(super) receiver: Arc<str>,
-    pub(super) stream: Stream,
-    pub(super) sequence: u64,
-    pub(super) after: u64,
-    pub(super) transfer: u64,
-    pub(super) remaining: Duration,
-}
-
-impl Label {
-    fn of(parcel: Parcel) -> (Self, Body) {
-        let Parcel {
-            receiver,
-            stream,
-            sequence,
-            after,
-            transfer,
-            remaining,
-            body,
-        } = parcel;
-        let label = Self {
-            receiver,
-            stream,
-            sequence,
-            after,
-            transfer,
-            remaining,
-        };
-        (label, body)
-    }
-}
 
 impl Core {
     /// Handles a parcel that arrived by this kind of transport.

@@ -14,11 +14,11 @@ use fipa_transport::{
 use super::action::Action;
 use super::custody_budget::CustodyBudget;
 use super::departed::Departed;
-use super::failures::Undelivered;
-use super::lane::LaneId;
-use super::notes::{Note, Notes};
-use super::route_report::Tallies;
+use super::ids::{LaneId, registration_by_name};
+use super::notes::{Note, Notes, note_parcel};
 use super::routes::Routes;
+use super::tally::Tallies;
+use super::undelivered::Undelivered;
 use super::{CoreConfig, News, Notice};
 use crate::Map;
 
@@ -288,34 +288,5 @@ impl AttemptTable {
             let (name, location) = (Arc::clone(receiver), location.clone());
             self.actions.push_back(Action::Taken { name, location });
         }
-    }
-}
-
-/// The registration that letters to this agent are for. A legacy peer's agent has no incarnation;
-/// one that is derived from its name stands for all its registrations.
-pub(crate) fn registration_of(entry: &Entry) -> Incarnation {
-    if entry.incarnation.is_known() {
-        entry.incarnation
-    } else {
-        registration_by_name(&entry.name)
-    }
-}
-
-/// The 64-bit FNV-1a hash: equal in every process, so that reports match their letters.
-fn registration_by_name(name: &str) -> Incarnation {
-    let step = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
-    let hash = name.as_bytes().iter().fold(0xcbf2_9ce4_8422_2325, step);
-    Incarnation::from_u64(hash.max(1))
-}
-
-pub(super) fn note_parcel(stream: Stream, receiver: Arc<str>, sequence: u64, body: Body) -> Parcel {
-    Parcel {
-        receiver,
-        stream,
-        sequence,
-        after: 0,
-        transfer: 0,
-        remaining: Duration::ZERO,
-        body,
     }
 }

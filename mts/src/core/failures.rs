@@ -12,42 +12,19 @@ use fipa_transport::{
 };
 
 use super::action::Action;
-use super::attempts::registration_of;
+use super::ids::registration_of;
 use super::inbox::Received;
 use super::lane::Delivery;
 use super::lanes::own_lane;
 use super::limits::log_omitted;
-use super::settlement::Origin;
+use super::origin::Origin;
+use super::undelivered::{FailureTarget, Undelivered};
 use super::{Core, News, Now, work};
 use crate::dial::{Claim, Endpoint, judge, located_at};
 use crate::failure::{Failed, Failure};
 
 /// Deadline of a failure message to a legacy peer's agent.
 const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
-
-/// Receiver of a failure message.
-#[derive(Debug, Clone)]
-pub(crate) enum FailureTarget {
-    /// This agent of this process.
-    Ours(Incarnation),
-    /// An agent of another service, which sent a letter with these parts.
-    Remote(Arc<Failed>),
-    /// The source of a legacy peer's letter.
-    LegacyPeer {
-        from: LegacySource,
-        failed: Arc<Failed>,
-    },
-}
-
-/// A failed delivery that a failure message reports.
-#[derive(Debug)]
-pub(crate) struct Undelivered {
-    pub(crate) sender: FailureTarget,
-    pub(crate) receiver: Arc<str>,
-    pub(crate) letter: Letter,
-    pub(crate) reason: FailureReason,
-    pub(crate) detail: String,
-}
 
 /// A letter whose message cannot be decoded, as far as its sender is told about it. Reading it takes time in
 /// proportion to the bytes of the letter, so it happens before the core is locked.

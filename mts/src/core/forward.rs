@@ -10,10 +10,11 @@ use fipa_transport::{
 };
 use smallvec::smallvec;
 
-use super::arrival::Label;
+use super::ids::LaneKey;
 use super::inbox::link_of;
-use super::lane::{Delivery, LaneKey};
-use super::settlement::{Origin, Upstream};
+use super::label::Label;
+use super::lane::Delivery;
+use super::origin::{Origin, Upstream};
 use super::{Core, MAX_DEADLINE, News, Now, ReadLetter};
 use crate::stamp::{self, EnvelopeParts};
 

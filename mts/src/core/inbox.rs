@@ -11,7 +11,7 @@ use fipa_transport::{
     Answer, FailureReason, Hop, Incarnation, Kind, Location, PeerId, Realm, Stream,
 };
 
-use super::arrival::Label;
+use super::label::Label;
 use super::rules::{self, Offer};
 use super::{CoreConfig, MAX_DEADLINE, work};
 use crate::gate::{Link, Source};

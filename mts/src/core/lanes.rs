@@ -7,8 +7,9 @@ use std::time::Duration;
 use fipa_sds::{Entry, Role};
 use fipa_transport::{Incarnation, Location, Stream};
 
-use super::attempts::{self, AttemptTable};
-use super::lane::{Delivery, Lane, LaneId, LaneKey, PauseEnd};
+use super::attempts::AttemptTable;
+use super::ids::{LaneId, LaneKey, registration_of};
+use super::lane::{Delivery, Lane, PauseEnd};
 use super::passes::{Concern, Step};
 use super::{Core, Now, work};
 
@@ -198,6 +199,6 @@ pub(super) fn own_lane(sender: Incarnation, entry: &Entry) -> LaneKey {
     match entry.role {
         Role::Agent => LaneKey::Name(sender, Arc::clone(&entry.name)),
         // Several services may have the same name.
-        _ => LaneKey::Service(Stream::between(sender, attempts::registration_of(entry))),
+        _ => LaneKey::Service(Stream::between(sender, registration_of(entry))),
     }
 }

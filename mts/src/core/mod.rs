@@ -25,7 +25,8 @@
 //! Beside them:
 //!
 //! * `rules`: the rules that keep a stream in order and alive, as pure functions.
-//! * `attempts`: what all lanes use; attempts in progress.
+//! * `attempts`: what all lanes use; attempts in progress. `ids`: names within a core.
+//! * `label`, `origin`, `tally`, `undelivered`: values that the others pass on.
 //! * `action`: what the runtime is asked to do.
 //! * `notes`: reports, credits and predecessors, which are repeated or wait for room.
 //! * `failures`: failure messages to senders; `limits`: their rate limits.
@@ -54,13 +55,16 @@ mod custody_budget;
 mod departed;
 mod failures;
 mod forward;
+mod ids;
 mod inbox;
+mod label;
 mod lane;
 mod lanes;
 mod limits;
 mod network;
 mod notes;
 mod notice;
+mod origin;
 mod passes;
 mod peers;
 mod principals;
@@ -71,6 +75,8 @@ mod routes;
 pub mod rules;
 mod send;
 mod settlement;
+mod tally;
+mod undelivered;
 mod unframed;
 mod waiting;
 #[doc(hidden)]
@@ -90,9 +96,11 @@ pub use self::action::Action;
 use self::attempts::{AttemptTable, Purpose};
 pub use self::config::{CoreConfig, MAX_DEADLINE};
 pub use self::failures::Undecodable;
+pub use self::ids::SendId;
+use self::ids::{LaneId, LaneKey};
 use self::inbox::Inbox;
 pub use self::inbox::Received;
-use self::lane::{Lane, LaneId, LaneKey, PauseEnd};
+use self::lane::{Lane, PauseEnd};
 use self::lanes::{IDLE_LANES, LANES_AT_ONCE};
 use self::limits::{FailureLimit, SenderLimit};
 pub use self::notice::{News, Notice};
@@ -102,7 +110,7 @@ pub use self::peers::{Peer, PeerState};
 use self::principals::Principals;
 pub use self::reading::{LetterReader, ReadLetter};
 pub use self::route_report::{Route, RouteCandidate, RouteState, Standing};
-pub use self::send::{SendId, Submission};
+pub use self::send::Submission;
 pub use self::unframed::Unframed;
 use self::waiting::{Unresolved, WaitingLetters};
 use crate::{AccessGate, Map};

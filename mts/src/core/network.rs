@@ -6,9 +6,9 @@ use fipa_sds::{Entry, Source};
 use fipa_transport::{Body, Incarnation, Introduction, Location, Principal, Stream};
 
 use super::lanes::is_at;
-use super::notes::Note;
+use super::notes::{Note, note_parcel};
 use super::passes::Concern;
-use super::{Core, Now, Peer, PeerState, attempts};
+use super::{Core, Now, Peer, PeerState};
 
 impl Core {
     /// Handles a change of the directory, after [`set_view`](Self::set_view). Of many lanes, this call
@@ -147,7 +147,7 @@ impl Core {
     pub fn greet(&mut self, services: Vec<(Arc<str>, Location)>) {
         for (name, location) in services {
             let no_stream = Stream::between(Incarnation::UNKNOWN, Incarnation::UNKNOWN);
-            let parcel = attempts::note_parcel(no_stream, name, 0, Body::Credit);
+            let parcel = note_parcel(no_stream, name, 0, Body::Credit);
             self.table.note(Note::once(location, parcel));
         }
     }

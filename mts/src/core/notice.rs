@@ -5,7 +5,7 @@ use std::sync::Arc;
 use fipa_acl::Letter;
 use fipa_transport::{Kind, Outcome, Stream};
 
-use super::SendId;
+use super::ids::SendId;
 
 /// An event of a letter to one receiver.
 ///

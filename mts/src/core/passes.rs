@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use fipa_transport::Incarnation;
 
-use super::lane::LaneId;
+use super::ids::LaneId;
 
 /// An event that may concern any lane.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

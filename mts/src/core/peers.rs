@@ -16,7 +16,8 @@ use fipa_transport::{
     TransportErrorKind, log_limit,
 };
 
-use super::attempts::{AttemptTable, Purpose, note_parcel};
+use super::attempts::{AttemptTable, Purpose};
+use super::notes::note_parcel;
 
 /// A message transport service in the configuration.
 #[derive(Debug, Clone, PartialEq, Eq)]

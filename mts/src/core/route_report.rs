@@ -1,16 +1,15 @@
 //! Reports of routes: the locations to which a letter would go now, and counters of each location
 //! since the start. The allocation of memory for a letter in advance also uses them.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 use fipa_sds::{Entry, Reach, Resolution, Role};
 use fipa_transport::{Incarnation, Kind, Location};
-use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 
-use super::attempts::{self, AttemptTable};
+use super::attempts::AttemptTable;
+use super::ids::registration_of;
 use super::routes::leads_to_letters;
 use super::{Core, Now};
 use crate::{Map, stamp};
@@ -86,59 +85,6 @@ pub struct RouteState {
     pub last_error: Option<String>,
     /// Seconds since that error.
     pub last_error_seconds: Option<u64>,
-}
-
-/// Counters of one location.
-#[derive(Debug, Default)]
-pub(crate) struct Tally {
-    pub(super) tried: AtomicU64,
-    pub(super) ended: AtomicU64,
-    pub(super) taken: AtomicU64,
-    pub(super) turned_back: AtomicU64,
-    pub(super) failed: AtomicU64,
-    last_error: Mutex<Option<(String, Instant)>>,
-}
-
-/// Counters of all locations.
-#[derive(Debug, Default)]
-pub(super) struct Tallies(Map<Location, Arc<Tally>>);
-
-/// Maximum number of locations with counters.
-const MAX_TALLIES: usize = 4096;
-
-impl Tally {
-    /// Increments a counter by one. Only the core writes its counters, which its caller has locked.
-    pub(super) fn add(counter: &AtomicU64) {
-        let before = counter.load(Ordering::Relaxed);
-        counter.store(before.wrapping_add(1), Ordering::Relaxed);
-    }
-
-    pub(super) fn fail(&self, now: Instant, error: &impl std::fmt::Display) {
-        Self::add(&self.failed);
-        *self.last_error.lock() = Some((error.to_string(), now));
-    }
-
-    fn in_flight(&self) -> u64 {
-        let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        read(&self.tried).saturating_sub(read(&self.ended))
-    }
-}
-
-impl Tallies {
-    /// Counters of this location. Beyond the limit, those without letters in flight are dropped.
-    pub(super) fn of(&mut self, location: &Location) -> Arc<Tally> {
-        if let Some(tally) = self.0.get(location) {
-            return Arc::clone(tally);
-        }
-        if self.0.len() >= MAX_TALLIES {
-            self.0.retain(|_, tally| tally.in_flight() > 0);
-        }
-        let tally = Arc::default();
-        if self.0.len() < MAX_TALLIES {
-            self.0.insert(location.clone(), Arc::clone(&tally));
-        }
-        tally
-    }
 }
 
 impl AttemptTable {
@@ -283,7 +229,7 @@ impl Core {
             };
             for entry in entries {
                 if let Some(way) = self.table.choose(now.instant, &entry, &[]) {
-                    reached.insert(attempts::registration_of(&entry), way.kind());
+                    reached.insert(registration_of(&entry), way.kind());
                 }
             }
         }

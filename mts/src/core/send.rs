@@ -8,16 +8,13 @@ use fipa_sds::{Entry, Resolution, Role};
 use fipa_transport::{Attempt, FailureReason, Incarnation, Outcome, Stream};
 
 use super::action::Action;
-use super::failures::{FailureTarget, Undelivered};
+use super::ids::{SendId, registration_of};
 use super::lane::Delivery;
 use super::lanes::own_lane;
-use super::settlement::Origin;
+use super::origin::Origin;
+use super::undelivered::{FailureTarget, Undelivered};
 use super::waiting::Unresolved;
-use super::{Core, MAX_DEADLINE, News, Now, attempts};
-
-/// Identifies a call of [`Core::send`] in its outcomes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct SendId(pub u64);
+use super::{Core, MAX_DEADLINE, News, Now};
 
 /// A letter that an agent of this process sends.
 #[derive(Debug, Clone)]
@@ -189,7 +186,7 @@ impl Core {
                 self.absent(send, sender, receiver, letter.clone());
             }
             for entry in entries {
-                let registration = attempts::registration_of(&entry);
+                let registration = registration_of(&entry);
                 if reached.contains(&registration) {
                     continue;
                 }
@@ -263,7 +260,7 @@ impl Core {
         letter: Letter,
         deadline: Instant,
     ) {
-        let stream = Stream::between(sender, attempts::registration_of(entry));
+        let stream = Stream::between(sender, registration_of(entry));
         let name = &entry.name;
         if self.closed {
             let reason = FailureReason::Closed;

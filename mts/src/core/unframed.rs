@@ -13,11 +13,12 @@ use fipa_transport::{
 
 use super::action::Action;
 use super::contacts::{Answered, answered};
-use super::failures::{FailureTarget, Undelivered, cannot_be_decoded};
+use super::failures::cannot_be_decoded;
 use super::lane::Delivery;
 use super::lanes::own_lane;
+use super::origin::Origin;
 use super::reading::{refused_name_of_legacy_peer, too_long};
-use super::settlement::Origin;
+use super::undelivered::{FailureTarget, Undelivered};
 use super::{Core, LetterReader, MAX_DEADLINE, News, Now, work};
 use crate::failure::Failed;
 use crate::gate::{self, LetterParts, Link};

@@ -8,7 +8,8 @@ use std::time::Instant;
 use fipa_acl::Letter;
 use fipa_transport::Incarnation;
 
-use super::{CoreConfig, SendId};
+use super::CoreConfig;
+use super::ids::SendId;
 use crate::Map;
 
 /// A letter that was sent and whose receivers are to be resolved.

@@ -8,10 +8,11 @@ use fipa_transport::{
     Report, Signature, TransportError, TransportErrorKind,
 };
 
-use super::super::attempts::{AttemptTable, registration_of};
-use super::super::route_report::Tally;
+use super::super::attempts::AttemptTable;
+use super::super::ids::registration_of;
+use super::super::origin::Settlement;
 use super::super::rules::{self, AttemptEnd, Belief, Cause, CustodyReport};
-use super::super::settlement::Settlement;
+use super::super::tally::Tally;
 use super::custody::ASK_CUSTODIAN_AFTER;
 use super::delivery::{Departure, State};
 use super::{CONGESTED_TRIES, ENDED_TIMEOUT, Lane, LaneKey, MOVING_TIMEOUT};

@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 use fipa_transport::{Answer, Hop, Incarnation, TransportError, TransportErrorKind};
 
 use super::super::attempts::AttemptTable;
+use super::super::origin::{Settlement, Upstream};
 use super::super::rules::{self, AttemptEnd, Cause, HoldDecision};
-use super::super::settlement::{Settlement, Upstream};
 use super::super::work;
 use super::Lane;
 use super::delivery::{Delivery, Holding, State};

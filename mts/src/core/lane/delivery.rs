@@ -11,8 +11,8 @@ use smallvec::SmallVec;
 
 use super::super::action::Action;
 use super::super::attempts::AttemptTable;
+use super::super::origin::{Origin, Upstream};
 use super::super::rules::{self, AttemptEnd};
-use super::super::settlement::{Origin, Upstream};
 use super::turns::{HandOvers, Pace, Turn};
 
 /// Maximum number of failed attempts in one letter's outcome.

@@ -39,11 +39,12 @@ pub(crate) use self::delivery::Delivery;
 use self::delivery::State;
 use self::pause::Pause;
 pub(crate) use self::pause::PauseEnd;
-use super::attempts::{AttemptTable, Purpose, registration_of};
-use super::failures::{FailureTarget, Undelivered};
-use super::route_report::Tally;
+use super::attempts::{AttemptTable, Purpose};
+use super::ids::{LaneId, LaneKey, registration_of};
+use super::origin::{Origin, Settlement};
 use super::rules;
-use super::settlement::{Origin, Settlement};
+use super::tally::Tally;
+use super::undelivered::{FailureTarget, Undelivered};
 use super::work;
 
 /// A lane from which a letter has left within this time moves. It holds back this many times the letters of a lane
@@ -79,23 +80,6 @@ const LETTER_BYTES: usize = 1536;
 /// Maximum number of letters that one visit of a lane ends or answers for because of a timeout, or because their
 /// receiver has left. The next visit follows at once.
 const ENDED_AT_ONCE: usize = 64;
-
-/// The number of a lane within its core.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub(crate) struct LaneId(pub(crate) u64);
-
-/// The letters of a lane.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(crate) enum LaneKey {
-    /// Letters that this process sends, from this agent or service to all registrations of this
-    /// name.
-    Name(Incarnation, Arc<str>),
-    /// Letters that this process sends to this registration of a service, whose name other services
-    /// may have.
-    Service(Stream),
-    /// Letters of others in custody.
-    Custody(Stream),
-}
 
 #[derive(Debug)]
 pub(crate) struct Lane {

@@ -5,6 +5,8 @@
 //! take long; all others are answered at once. A request with an unknown ontology is answered
 //! with `not-understood`.
 
+pub(crate) mod questions;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::error::Error;
 use std::sync::Arc;
@@ -20,16 +22,16 @@ use fipa_transport_net::{Refusals, RefusedDials};
 use parking_lot::Mutex;
 use tokio::task::JoinSet;
 
+use self::questions::{QuestionRates, Questions};
 use super::KnownPeers;
 use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
 use super::introductions::Grounds;
 use super::namesakes::Namesakes;
 use super::neighbors::Neighbors;
-use super::presence::{QuestionRates, Questions};
 use crate::admin::contact::{self, Introduced};
 use crate::admin::routes;
-use crate::domain::presence;
 use crate::domain::service::Service;
+use crate::domain::{presence, report};
 
 /// Deadline for the delivery of an answer.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
@@ -252,7 +254,7 @@ impl GatewayAgent {
             }
             _ => Query::all(),
         };
-        let entries = routes::agents(&*self.view, &query);
+        let entries = report::agents(&*self.view, &query);
         let neighbors = self.neighbors.all().into_iter();
         let report = routes::Report {
             neighbors: neighbors.map(Into::into).collect(),

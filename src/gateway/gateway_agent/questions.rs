@@ -16,7 +16,7 @@ use fipa_mts::core::Received;
 use fipa_sds::{Directory, Entry, Reach, Role, Source};
 use fipa_transport::{Incarnation, PeerId, TokenBucket, log_limit};
 
-use super::gateway_agent::GatewayAgent;
+use super::GatewayAgent;
 use crate::domain::presence::{self, Answer, Asked, MAX_ASKED};
 
 /// Time for which further questions to a gateway wait for its answer to the previous letter.
@@ -33,7 +33,7 @@ const QUESTION_BYTES_PER_SECOND: f64 = 64.0 * 1024.0;
 
 /// The rates of the questions of other gateways: the letters to the gateway wait while one is answered.
 #[derive(Debug, Default)]
-pub(super) struct QuestionRates {
+pub(in crate::gateway) struct QuestionRates {
     /// The peers that asked within the time in which a bucket fills.
     peers: HashMap<PeerId, TokenBucket>,
 }
@@ -55,7 +55,7 @@ impl QuestionRates {
 
 /// The questions of agents of this host that other gateways are to answer.
 #[derive(Debug, Default)]
-pub(super) struct Questions {
+pub(in crate::gateway) struct Questions {
     of: HashMap<Incarnation, OfGateway>,
     /// The letters that wait for an answer, by agent and conversation.
     open: HashMap<(Incarnation, String), Open>,
