@@ -16,6 +16,7 @@
 
 #[cfg(feature = "conformance")]
 pub mod conformance;
+mod error;
 mod faulty;
 mod incarnation;
 mod location;
@@ -24,12 +25,14 @@ mod outcome;
 mod owner;
 mod parcel;
 mod peer_id;
+mod principal;
 mod quota_address;
 pub mod threads;
 mod token_bucket;
 mod transport;
 pub mod wire;
 
+pub use error::{ListenError, TransportError, TransportErrorKind};
 pub use faulty::{Fault, Faulty};
 pub use incarnation::{Incarnation, IncarnationError};
 pub use location::{Kind, Location, LocationError, Signature};
@@ -37,10 +40,10 @@ pub use outcome::{Attempt, FailureReason, Outcome};
 pub use owner::{Forked, OwnerProcess};
 pub use parcel::{Body, Parcel, Realm, Report, Stream};
 pub use peer_id::PeerId;
+pub use principal::Principal;
 pub use quota_address::{quota_address, scoped_quota_address};
 pub use token_bucket::TokenBucket;
 pub use transport::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, LegacySource,
-    ListenError, LoanedContent, Mandate, Principal, Sink, Ticket, Transport, TransportError,
-    TransportErrorKind, Verdict,
+    LoanedContent, Mandate, Sink, Ticket, Transport, Verdict,
 };
