@@ -197,7 +197,7 @@ async fn hand_over(peer: TcpConfig, sender: &str, to: &Entry, at: &[Location]) -
     };
     let at = at.iter().find(|it| it.kind() == Kind::Tcp);
     transport
-        .dispatch(AttemptId(1), at.unwrap(), parcel)
+        .post(AttemptId(1), at.unwrap(), parcel)
         .unwrap();
     let began = Instant::now();
     loop {

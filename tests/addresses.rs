@@ -78,7 +78,7 @@ async fn an_address_that_does_not_answer_costs_no_attempt() {
         .content("hello")
         .build()
         .unwrap();
-    let sent = rovers.send(Submission {
+    let sent = rovers.submit(Submission {
         sender: ROVER,
         letter: letter_for(&message, SystemTime::now()).unwrap(),
         receivers: vec!["arm".into()],

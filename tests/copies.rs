@@ -67,7 +67,7 @@ async fn only_the_kernel_copies_large_content() {
             .loan(ROVER, &["arm"], room, len, draft.tail_len());
         loan.content_mut().fill(number as u8);
         let (_, letter) = draft.complete(loan.freeze());
-        let sending = rovers.mts.send(Submission {
+        let sending = rovers.mts.submit(Submission {
             sender: ROVER,
             letter,
             receivers: vec!["arm".into()],

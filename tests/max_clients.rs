@@ -79,7 +79,7 @@ async fn send(
     to: &TestService,
     sequence: usize,
 ) -> Outcome {
-    let sending = from.mts.send(Submission {
+    let sending = from.mts.submit(Submission {
         sender: rover,
         letter: letter(sequence),
         receivers: vec!["arm".into()],

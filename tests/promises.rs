@@ -220,7 +220,7 @@ async fn send_all(
 
 fn send(mts: &fipa_mts::Mts, stream: usize, number: usize, draft: Draft) -> Sending {
     let (name, sender) = SENDERS[stream];
-    mts.send(Submission {
+    mts.submit(Submission {
         sender,
         letter: draft.letter(name, number),
         receivers: vec!["arm".into()],
@@ -441,7 +441,7 @@ async fn a_letter_is_not_sent_unencrypted_and_its_outcome_has_the_failed_attempt
         let rovers = start("rovers", &ours);
         rovers.register_arm_at(locations);
         rovers.mts.register("rover".into(), ROVER);
-        let sending = rovers.mts.send(Submission {
+        let sending = rovers.mts.submit(Submission {
             sender: ROVER,
             letter: letter(1),
             receivers: vec!["arm".into()],
@@ -534,7 +534,7 @@ impl RepeatingPeer {
         };
         let attempt = AttemptId(attempt);
         self.transport
-            .dispatch(attempt, &to.at(kind), parcel)
+            .post(attempt, &to.at(kind), parcel)
             .unwrap();
         until_async("an answer", || {
             self.conclusions.0.lock().contains_key(&attempt)

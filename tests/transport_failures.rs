@@ -79,7 +79,7 @@ async fn close_transports(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
                 spawn_blocking(move || transport.close()),
             ));
         }
-        under_way.push_back(rovers.mts.send(submission(number)));
+        under_way.push_back(rovers.mts.submit(submission(number)));
         if under_way.len() >= WINDOW {
             went.push(delivered(under_way.pop_front().unwrap()).await);
         }
@@ -92,7 +92,7 @@ async fn close_transports(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
         timeout(WATCHDOG, closing).await.unwrap().unwrap();
         closed.push((kind, at));
     }
-    went.push(delivered(rovers.mts.send(submission(total))).await);
+    went.push(delivered(rovers.mts.submit(submission(total))).await);
     timeout(WATCHDOG, receiving).await.unwrap().unwrap();
     assert!(arms.mts.try_receive(ARM).is_none(), "a letter twice");
 

@@ -83,7 +83,7 @@ impl Machine {
         }
         if !self.optimized {
             warnings.push(
-                "this command was built without optimization: cargo run --release -- bench"
+                "this command was built without optimization: cargo run --profile dist -- bench"
                     .to_owned(),
             );
         }

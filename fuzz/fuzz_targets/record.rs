@@ -8,7 +8,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use fipa_acl::{Envelope, Letter};
-use fipa_mts::core::{News, Notice, SendId};
+use fipa_mts::core::{News, Notice, SubmissionId};
 use fipa_mts::watch::record::{MAX_CONTENT, MAX_LEN, RecordBody, Wish, of};
 use fipa_mts::watch::{Event, Joiner, Record, Source};
 use fipa_transport::{Incarnation, Stream};
@@ -99,7 +99,7 @@ fn written_records_are_accepted(letter: &Letter) {
         sequence: 3,
         receiver: "arm_1".into(),
         news: News::Sent {
-            send: Some(SendId(9)),
+            send: Some(SubmissionId(9)),
             letter: letter.clone(),
         },
     };

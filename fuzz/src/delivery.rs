@@ -20,7 +20,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use fipa_acl::{AgentId, Envelope, Letter, Message, Performative};
-use fipa_mts::core::{Action, Core, CoreConfig, Now, SendId, Submission, Unframed};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, SubmissionId, Unframed};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
 use fipa_transport::{
@@ -225,7 +225,7 @@ struct World {
     coming: VecDeque<(Instant, Incarnation, Coming)>,
     /// Attempts of honest services at malicious ones. The input decides about the answers.
     held: Vec<(Incarnation, AttemptId, Parcel)>,
-    sends: BTreeMap<(Incarnation, SendId), u64>,
+    sends: BTreeMap<(Incarnation, SubmissionId), u64>,
     sent: Vec<Sent>,
     last_taken: BTreeMap<(Incarnation, Incarnation), u64>,
     /// Introductions of the malicious gateway that [`part`](Self::part) can revoke.
@@ -450,7 +450,7 @@ impl World {
             deadline,
         };
         let honest = [ARM, ROVER].contains(&receiver);
-        let (send, count) = self.service(at).core.send(now, submission);
+        let (send, count) = self.service(at).core.submit(now, submission);
         // The view does not change, so a refresh adds nothing.
         assert!(count.is_none_or(|count| count == 1));
         self.sends.insert((at, send), number);

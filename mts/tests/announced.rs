@@ -174,7 +174,7 @@ fn parcel() -> Parcel {
         receivers: vec!["arm".into()],
         deadline: Duration::from_secs(5),
     };
-    core.send(now, submission);
+    core.submit(now, submission);
     match core.poll_action() {
         Some(Action::Dispatch { parcel, .. }) => parcel,
         other => panic!("{other:?}"),

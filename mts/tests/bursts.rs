@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Letter, Message, Performative};
-use fipa_mts::core::{Action, Core, CoreConfig, Now, SendId, Submission};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, SubmissionId};
 use fipa_mts::{AccessGate, LetterParts, Link, letter_for};
 use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Reach, Registration, View};
 use fipa_transport::{
@@ -160,10 +160,10 @@ struct Path {
     start: Instant,
     now: Instant,
     /// The letters of each stream that were not taken yet, and the times at which letters were taken.
-    queues: Vec<VecDeque<SendId>>,
-    taken: HashMap<SendId, Instant>,
+    queues: Vec<VecDeque<SubmissionId>>,
+    taken: HashMap<SubmissionId, Instant>,
     gaps: Vec<(Option<Instant>, Duration)>,
-    outcomes: Vec<(SendId, Instant, Outcome)>,
+    outcomes: Vec<(SubmissionId, Instant, Outcome)>,
     /// Parcels without room, by their sender.
     without_room: [usize; SERVICES],
 }
@@ -327,7 +327,7 @@ impl Path {
             receivers: vec![name.into()],
             deadline: Duration::from_secs(30),
         };
-        let (id, outcomes) = self.services[SENDER].core.send(now, submission);
+        let (id, outcomes) = self.services[SENDER].core.submit(now, submission);
         assert_eq!(outcomes, Some(1));
         if !refused {
             self.queues[stream].push_back(id);

@@ -45,7 +45,7 @@ fn only_an_attempt_that_ended_frees_room() {
         receivers: vec!["arm_.*".into()],
         deadline: Duration::from_secs(5),
     };
-    let (_, expected) = core.send(now, submission);
+    let (_, expected) = core.submit(now, submission);
     // A pattern is matched after a refresh.
     assert_eq!(expected, None);
 
@@ -118,7 +118,7 @@ fn a_full_lane_that_moves_holds_letters_back() {
             receivers: vec!["arm".into()],
             deadline: Duration::from_secs(60),
         };
-        core.send(now, submission);
+        core.submit(now, submission);
     };
     // The letters that were dispatched, and whether a letter failed.
     let look = |core: &mut Core| {

@@ -91,7 +91,7 @@ impl Transport for Recording {
         Ok(Vec::new())
     }
 
-    fn dispatch(&self, _: AttemptId, _: &Location, parcel: Parcel) -> Result<(), TransportError> {
+    fn post(&self, _: AttemptId, _: &Location, parcel: Parcel) -> Result<(), TransportError> {
         let receiver = parcel.receiver.to_string();
         self.events.lock().push(Event::Dispatched(receiver));
         Ok(())

@@ -88,7 +88,7 @@ impl Service {
             deadline: DEADLINE,
         };
         let now = self.at(ms);
-        self.core.send(now, submission);
+        self.core.submit(now, submission);
     }
 
     /// A letter arrives for `arm`, in this transfer of the previous service.

@@ -412,7 +412,7 @@ fn a_failed_route_is_avoided_during_its_backoff() {
         let receivers = vec!["arm".into()];
         let deadline = Duration::from_secs(2);
         let letter = letter();
-        core.send(
+        core.submit(
             at(ms),
             Submission {
                 sender: ROVER,

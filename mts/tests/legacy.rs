@@ -75,7 +75,7 @@ impl Bench {
             receivers: vec!["arm".into()],
             deadline,
         };
-        self.core.send(self.at(ms), submission);
+        self.core.submit(self.at(ms), submission);
     }
 
     /// The next letter that the core dispatches, and the location.

@@ -645,7 +645,7 @@ fn a_letter_to_a_legacy_peers_agent_is_sent_not_delivered() {
         .content("hello")
         .build()
         .unwrap();
-    let (_, outcomes) = process.send(
+    let (_, outcomes) = process.submit(
         now(),
         Submission {
             sender: rover,
@@ -708,7 +708,7 @@ fn letters_to_an_unreachable_legacy_peer_fail_like_others() {
         .build()
         .unwrap();
     let start = now();
-    core.send(
+    core.submit(
         start,
         Submission {
             sender: rover,

@@ -276,7 +276,7 @@ fn waiting_letters_leave_when_their_receiver_is_reachable_again() {
         receivers: vec!["arm".into()],
         deadline: Duration::from_secs(60),
     };
-    bench.core.send(bench.now, submission);
+    bench.core.submit(bench.now, submission);
     let dispatched = |bench: &mut Bench| loop {
         match bench.core.poll_action()? {
             Action::Dispatch { attempt, .. } => return Some(attempt),

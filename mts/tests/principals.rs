@@ -335,7 +335,7 @@ fn letters_go_to_the_registration_of_the_name_that_they_are_sent_to() {
         receivers: vec!["rover".into()],
         deadline: Duration::from_secs(5),
     };
-    bench.core.send(bench.now, submission);
+    bench.core.submit(bench.now, submission);
     let Some(Action::Dispatch { location, .. }) = bench.core.poll_action() else {
         panic!("the letter is dispatched");
     };
@@ -378,7 +378,7 @@ fn only_a_service_that_was_handed_a_letter_can_report_on_it() {
         receivers: vec!["rover".into()],
         deadline: Duration::from_secs(5),
     };
-    bench.core.send(bench.now, submission);
+    bench.core.submit(bench.now, submission);
     let Some(Action::Dispatch {
         attempt, parcel, ..
     }) = bench.core.poll_action()
@@ -512,7 +512,7 @@ fn a_report_counts_only_from_a_service_that_introduced_itself_with_its_certifica
         receivers: vec!["rover".into()],
         deadline: Duration::from_secs(5),
     };
-    bench.core.send(bench.now, submission);
+    bench.core.submit(bench.now, submission);
     let (_, location, parcel) = dispatched(&mut bench).expect("the letter is dispatched");
     assert_eq!(location.incarnation(), away);
     let delivered = Outcome::Delivered {

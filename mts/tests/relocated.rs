@@ -99,7 +99,7 @@ impl Gateway {
             receivers: vec!["arm".into()],
             deadline: Duration::from_secs(60),
         };
-        self.core.send(self.now, submission);
+        self.core.submit(self.now, submission);
     }
 
     /// Handles an announcement. Returns the locations that the peer has left.

@@ -69,7 +69,7 @@ impl Transport for Shared {
         Ok(Vec::new())
     }
 
-    fn dispatch(&self, _: AttemptId, _: &Location, parcel: Parcel) -> Result<(), TransportError> {
+    fn post(&self, _: AttemptId, _: &Location, parcel: Parcel) -> Result<(), TransportError> {
         self.sent.lock().push(parcel);
         Ok(())
     }

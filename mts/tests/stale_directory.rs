@@ -100,7 +100,7 @@ impl Sender {
             receivers: vec!["arm".into()],
             deadline: Duration::from_secs(60),
         };
-        self.core.send(self.now, submission);
+        self.core.submit(self.now, submission);
     }
 
     /// Carries out the actions of the core. `answer` has the answer to a letter for a registration.

@@ -271,7 +271,7 @@ impl Service {
             receivers: vec!["arm".into()],
             deadline: TIME * 2,
         };
-        self.core.send(self.clocks(), submission);
+        self.core.submit(self.clocks(), submission);
         self.run();
         self
     }
@@ -505,7 +505,7 @@ fn only_the_lane_of_the_letter_pauses() {
         deadline: TIME,
     };
     let now = service.clocks();
-    service.core.send(now, submission);
+    service.core.submit(now, submission);
     let dispatched = std::iter::from_fn(|| service.core.poll_action());
     let mut dispatched = dispatched.filter_map(|action| match action {
         Action::Dispatch { parcel, .. } => Some(parcel.receiver),
@@ -526,7 +526,7 @@ fn a_credit_after_progress_ends_the_pause() {
             receivers: vec!["arm".into()],
             deadline: TIME,
         };
-        service.core.send(now, submission);
+        service.core.submit(now, submission);
     }
     let dispatched = |service: &mut Service| {
         let actions = std::iter::from_fn(|| service.core.poll_action());

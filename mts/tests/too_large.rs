@@ -70,7 +70,7 @@ impl Bench {
             receivers: vec!["arm".into()],
             deadline: Duration::from_secs(5),
         };
-        self.core.send(self.at(0), submission);
+        self.core.submit(self.at(0), submission);
     }
 
     fn dispatched(&mut self) -> (AttemptId, Kind) {

@@ -34,7 +34,7 @@ impl Transport for Slow {
         Ok(Vec::new())
     }
 
-    fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), TransportError> {
+    fn post(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), TransportError> {
         Err(TransportError::new(
             TransportErrorKind::Unreachable,
             "no process is there",

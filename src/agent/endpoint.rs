@@ -151,7 +151,7 @@ impl Endpoint {
             return Ok(Sent::held(receivers, held, unsettled));
         }
         let mts = self.mts();
-        let sending = mts.send_to_agents(self.incarnation, letter, receivers, deadline);
+        let sending = mts.submit_to_agents(self.incarnation, letter, receivers, deadline);
         Ok(Sent::new(sending, unsettled))
     }
 

@@ -322,7 +322,7 @@ fn send(
     let reached: Vec<AgentId> = reached.cloned().collect();
     if !reached.is_empty() {
         let left = until.saturating_duration_since(Instant::now());
-        sent.push(mts.send_to_agents(sender, letter.clone(), &reached, left));
+        sent.push(mts.submit_to_agents(sender, letter.clone(), &reached, left));
     }
     for (receiver, why) in refused {
         let addresses = receiver.addresses().iter();

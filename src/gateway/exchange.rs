@@ -621,7 +621,7 @@ impl Means {
             receivers: Vec::new(),
             deadline,
         };
-        Some(self.service.mts.send_to(submission, to))
+        Some(self.service.mts.submit_to(submission, to))
     }
 }
 

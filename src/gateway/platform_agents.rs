@@ -246,13 +246,13 @@ impl PlatformAgents {
         let registration = Incarnation::from_u64(answer.registration);
         if !registration.is_known() {
             submission.receivers = vec![Arc::clone(&answer.to)];
-            return Some(self.service.mts.send(submission));
+            return Some(self.service.mts.submit(submission));
         }
         let Some(to) = self.view.registered_as(registration, &answer.to) else {
             log_limit::info!("dropping a reply: its requester is no longer registered");
             return None;
         };
-        Some(self.service.mts.send_to(submission, &to))
+        Some(self.service.mts.submit_to(submission, &to))
     }
 }
 

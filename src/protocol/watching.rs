@@ -187,7 +187,7 @@ impl PartnerWatch {
             });
         match letter {
             // The outcome is not awaited: a lost question has no answer.
-            Ok(letter) => drop(endpoint.mts().send_to(
+            Ok(letter) => drop(endpoint.mts().submit_to(
                 Submission {
                     sender: endpoint.incarnation,
                     letter,

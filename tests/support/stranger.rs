@@ -90,7 +90,7 @@ impl Stranger {
             body: Body::Letter(letter_for(&message, SystemTime::now()).unwrap()),
         };
         self.transport
-            .dispatch(AttemptId(self.sent), &self.at, parcel)
+            .post(AttemptId(self.sent), &self.at, parcel)
             .unwrap();
     }
 

@@ -213,7 +213,7 @@ fn round_trip(criterion: &mut Criterion) {
             group.bench_function(BenchmarkId::new(name, size), |bencher| {
                 bencher.iter(|| {
                     let attempt = AttemptId(1);
-                    sender.dispatch(attempt, &there, parcel.clone()).unwrap();
+                    sender.post(attempt, &there, parcel.clone()).unwrap();
                     let conclusion = conclusions.recv().unwrap();
                     assert_eq!(conclusion, Conclusion::Answered(Answer::Accepted));
                 });

@@ -279,7 +279,7 @@ impl Side {
         let parcel = parcel(LEN);
         let (begun, before) = (Instant::now(), processor("self"));
         for attempt in 0..COUNT {
-            self.dispatch(attempt, &to, &parcel);
+            self.post(attempt, &to, &parcel);
         }
         self.sink.wait_for(COUNT);
         Flood {
@@ -316,7 +316,7 @@ impl Side {
         let (to, parcel) = (location(echo.port()), parcel(SHORT));
         let trips = (0..=TRIPS as u64).map(|attempt| {
             let begun = Instant::now();
-            self.dispatch(attempt, &to, &parcel);
+            self.post(attempt, &to, &parcel);
             self.sink.wait_for_arrival();
             begun.elapsed().as_secs_f64() * 1e6
         });
@@ -325,11 +325,8 @@ impl Side {
         median(&mut trips)
     }
 
-    fn dispatch(&self, attempt: u64, to: &Location, parcel: &Parcel) {
-        while let Err(error) = self
-            .transport
-            .dispatch(AttemptId(attempt), to, parcel.clone())
-        {
+    fn post(&self, attempt: u64, to: &Location, parcel: &Parcel) {
+        while let Err(error) = self.transport.post(AttemptId(attempt), to, parcel.clone()) {
             assert_eq!(error.fault, TransportErrorKind::Congested, "{error}");
             std::thread::sleep(Duration::from_millis(1));
         }

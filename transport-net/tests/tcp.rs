@@ -36,8 +36,7 @@ fn letters_that_are_sent_in_a_row_share_a_write() {
         a.listen(sink.clone()).unwrap();
         let send = |attempt| {
             let parcel = parcel(attempt, "x");
-            a.dispatch(AttemptId(attempt), b.location(), parcel)
-                .unwrap();
+            a.post(AttemptId(attempt), b.location(), parcel).unwrap();
         };
         let concluded = || sink.record.lock().concluded.len();
         send(0);
@@ -335,7 +334,7 @@ fn a_runtime_that_was_shut_down_is_reported() {
         orphan
     };
     let error = orphan
-        .dispatch(AttemptId(1), b.location(), parcel(1, "x"))
+        .post(AttemptId(1), b.location(), parcel(1, "x"))
         .unwrap_err();
     assert_eq!(error.fault, TransportErrorKind::Closed, "{error}");
 }

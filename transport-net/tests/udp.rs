@@ -51,7 +51,7 @@ impl Party {
 
     fn assert_reaches(&self, attempt: u64, to: &Location) {
         self.transport
-            .dispatch(AttemptId(attempt), to, parcel(attempt, "there?"))
+            .post(AttemptId(attempt), to, parcel(attempt, "there?"))
             .unwrap();
         assert_eq!(self.conclusion(attempt), accepted());
     }
@@ -84,7 +84,7 @@ fn a_name_resolves_to_the_address_that_answers() {
     near.assert_reaches(1, &named);
     let unknown = Location::new(Kind::Udp, "nobody.invalid:7").unwrap();
     near.transport
-        .dispatch(AttemptId(2), &unknown, parcel(1, "x"))
+        .post(AttemptId(2), &unknown, parcel(1, "x"))
         .unwrap();
     match near.conclusion(2) {
         Conclusion::NotSent(error) => {
@@ -229,7 +229,7 @@ fn a_peer_that_stops_answering_is_given_up() {
     let to = Location::new(Kind::Udp, &mute.local_addr().unwrap().to_string()).unwrap();
     for attempt in 0..3 {
         near.transport
-            .dispatch(AttemptId(attempt), &to, parcel(attempt, "x"))
+            .post(AttemptId(attempt), &to, parcel(attempt, "x"))
             .unwrap();
     }
     for attempt in 0..3 {
@@ -256,7 +256,7 @@ fn an_unreachable_peer_is_detected_by_an_error_of_the_system() {
     same.connect(same.local_addr().unwrap()).unwrap();
     let sent = near
         .transport
-        .dispatch(AttemptId(2), &gone, parcel(2, "x"))
+        .post(AttemptId(2), &gone, parcel(2, "x"))
         .map(|()| near.conclusion(2));
     match sent {
         Ok(Conclusion::NotSent(error)) => {

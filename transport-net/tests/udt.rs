@@ -45,7 +45,7 @@ impl Paused {
     }
 
     fn send(&self, attempt: u64, to: &Location, parcel: Parcel) -> Result<(), TransportError> {
-        self.transport.dispatch(AttemptId(attempt), to, parcel)
+        self.transport.post(AttemptId(attempt), to, parcel)
     }
 
     fn abandon(&self, attempt: u64, to: &Location) -> Abandoned {
@@ -204,7 +204,7 @@ fn faults_that_are_certain_at_once_are_returned() {
     let runtime = common::runtime();
     let unopened = UdtTransport::new(config.clone(), runtime.handle().clone());
     let to = Location::new(Kind::Udt, "127.0.0.1:9").unwrap();
-    let refused = unopened.dispatch(AttemptId(1), &to, message_parcel(1, "x"));
+    let refused = unopened.post(AttemptId(1), &to, message_parcel(1, "x"));
     let error = refused.unwrap_err();
     assert_eq!(error.fault, TransportErrorKind::Closed);
     assert!(error.detail.contains("listen"), "{error}");
@@ -328,7 +328,7 @@ fn closing_concludes_the_letters_that_wait_for_their_translation() {
     } = with_letters();
     drop(runtime);
     assert_not_sent(&sink);
-    let refused = transport.dispatch(AttemptId(4), to, message_parcel(4, "late"));
+    let refused = transport.post(AttemptId(4), to, message_parcel(4, "late"));
     assert_eq!(refused.unwrap_err().fault, TransportErrorKind::Closed);
     assert_eq!(receiver.transport.counters().accepted, 0);
 }

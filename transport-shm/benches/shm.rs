@@ -309,7 +309,7 @@ impl OneToMany {
     fn round(&self, parcel: &Parcel) {
         let before = self.sent.0.load(Ordering::Acquire);
         for to in &self.locations {
-            let dispatched = self.sender.dispatch(AttemptId(1), to, parcel.clone());
+            let dispatched = self.sender.post(AttemptId(1), to, parcel.clone());
             dispatched.expect("room");
         }
         while self.sent.0.load(Ordering::Acquire) - before < self.locations.len() as u64 {
@@ -344,7 +344,7 @@ impl TransportPair {
 
     fn round(&self, parcel: Parcel) {
         let before = self.sent.0.load(Ordering::Acquire);
-        self.dispatch(parcel);
+        self.post(parcel);
         while self.sent.0.load(Ordering::Acquire) == before {
             self.sender.drive();
         }
@@ -356,7 +356,7 @@ impl TransportPair {
         let mut begun = 0;
         while done() < total {
             if begun < total && begun < done() + WINDOW {
-                self.dispatch(parcel.clone());
+                self.post(parcel.clone());
                 begun += 1;
             } else {
                 self.sender.drive();
@@ -364,8 +364,8 @@ impl TransportPair {
         }
     }
 
-    fn dispatch(&self, parcel: Parcel) {
-        let dispatched = self.sender.dispatch(AttemptId(1), &self.to, parcel);
+    fn post(&self, parcel: Parcel) {
+        let dispatched = self.sender.post(AttemptId(1), &self.to, parcel);
         dispatched.expect("room");
     }
 }

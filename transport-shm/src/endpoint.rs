@@ -424,7 +424,7 @@ impl Endpoint {
         if let Err(error) = started {
             let error = TransportError::new(TransportErrorKind::Congested, error);
             let endpoint = Arc::downgrade(self);
-            // A task, because the sink must not be called from within `dispatch`.
+            // A task, because the sink must not be called from within `post`.
             self.runtime.spawn(async move {
                 if let Some(endpoint) = endpoint.upgrade() {
                     let mut concluded = Concluded::new();

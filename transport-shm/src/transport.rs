@@ -194,7 +194,7 @@ impl Transport for ShmTransport {
         Ok(vec![self.location()])
     }
 
-    fn dispatch(
+    fn post(
         &self,
         attempt: AttemptId,
         to: &Location,

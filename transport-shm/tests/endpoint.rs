@@ -22,7 +22,7 @@ fn closing_removes_all_files() {
     let domain = TestDomain::new();
     let (one, sink) = domain.listening();
     let (other, got) = domain.listening();
-    one.dispatch(attempt(), &other.location(), parcel(vec![1; 9000].into()))
+    one.post(attempt(), &other.location(), parcel(vec![1; 9000].into()))
         .unwrap();
     until("answer", || sink.conclusions() == 1);
     assert!(!domain.files().is_empty());
@@ -40,7 +40,7 @@ fn domains_are_isolated() {
     let (one, _) = here.listening();
     let (other, _) = there.listening();
     let refused = one
-        .dispatch(attempt(), &other.location(), parcel(Bytes::new()))
+        .post(attempt(), &other.location(), parcel(Bytes::new()))
         .unwrap_err();
     assert_eq!(refused.fault, TransportErrorKind::Unreachable);
 }
@@ -66,8 +66,7 @@ fn many_threads_drive_one_endpoint() {
             let attempt = attempt();
             // The window is full at times.
             until("room", || {
-                one.dispatch(attempt, &other.location(), parcel.clone())
-                    .is_ok()
+                one.post(attempt, &other.location(), parcel.clone()).is_ok()
             });
             attempts.push((attempt, parcel.sequence));
         }
@@ -104,10 +103,10 @@ fn a_full_window_is_an_error() {
     let window = domain.config().window;
     for _ in 0..window {
         sender
-            .dispatch(attempt(), &receiver.location(), parcel(Bytes::new()))
+            .post(attempt(), &receiver.location(), parcel(Bytes::new()))
             .unwrap();
     }
-    let refused = sender.dispatch(attempt(), &receiver.location(), parcel(Bytes::new()));
+    let refused = sender.post(attempt(), &receiver.location(), parcel(Bytes::new()));
     assert_eq!(refused.unwrap_err().fault, TransportErrorKind::Congested);
 }
 
@@ -119,8 +118,8 @@ fn an_answered_parcel_takes_no_place_in_the_window_and_its_successor_no_loan() {
     let (receiver, received) = domain.listening();
     let to = receiver.location();
     send_until_accepted((&sender, &sink), &receiver);
-    let dispatch = |content: &'static [u8]| {
-        let sent = sender.dispatch(attempt(), &to, parcel(Bytes::from_static(content)));
+    let post = |content: &'static [u8]| {
+        let sent = sender.post(attempt(), &to, parcel(Bytes::from_static(content)));
         sent.map_err(|error| error.fault)
     };
     let answered = |number: usize| {
@@ -131,26 +130,26 @@ fn an_answered_parcel_takes_no_place_in_the_window_and_its_successor_no_loan() {
     };
     // The short parcel is answered, and memory is taken for another one.
     let before = sink.conclusions();
-    dispatch(b"short").unwrap();
+    post(b"short").unwrap();
     answered(before + 1);
     let loans: Vec<_> = (0..config.max_loans)
         .map(|_| sender.loan(&to, 100, 100, 1).unwrap().unwrap())
         .collect();
     // One that is too long for that memory can be sent beside all loans, too.
-    dispatch(&[7; 10_000]).unwrap();
+    post(&[7; 10_000]).unwrap();
     answered(before + 2);
-    dispatch(b"short").unwrap();
+    post(b"short").unwrap();
     answered(before + 3);
     drop(loans);
     // The receiver waits within the first of these parcels.
     let stopped = received.arrived.lock().unwrap();
     for _ in 0..config.window {
-        dispatch(b"short").unwrap();
+        post(b"short").unwrap();
     }
-    assert_eq!(dispatch(b"short"), Err(TransportErrorKind::Congested));
+    assert_eq!(post(b"short"), Err(TransportErrorKind::Congested));
     drop(stopped);
     answered(before + 3 + config.window);
-    dispatch(b"short").unwrap();
+    post(b"short").unwrap();
     answered(before + 4 + config.window);
 }
 
@@ -161,13 +160,13 @@ fn an_abandoned_parcel_does_not_hide_later_ones() {
     // Does not listen yet, so it takes nothing.
     let receiver = domain.endpoint();
     open(&sender, &receiver.location());
-    let dispatch = || {
+    let post = || {
         let attempt = attempt();
-        let sent = sender.dispatch(attempt, &receiver.location(), parcel(Bytes::new()));
+        let sent = sender.post(attempt, &receiver.location(), parcel(Bytes::new()));
         sent.unwrap();
         attempt
     };
-    let abandoned = [dispatch(), dispatch(), dispatch()][1];
+    let abandoned = [post(), post(), post()][1];
     assert_eq!(
         sender.abandon(abandoned, &receiver.location()),
         Abandoned::Unconfirmed
@@ -177,7 +176,7 @@ fn an_abandoned_parcel_does_not_hide_later_ones() {
     until("answers", || sink.conclusions() == 2);
     // Three parcels were announced and two taken.
     for number in 3..20 {
-        dispatch();
+        post();
         until("answer", || {
             receiver.drive();
             sender.drive();
@@ -198,7 +197,7 @@ fn peers_are_bounded_and_the_least_recently_used_is_closed() {
         // A peer is idle when the thread that has opened its mailbox has ended.
         until("an idle peer", || {
             let parcel = parcel(vec![3; 2000].into());
-            match sender.dispatch(attempt(), &receiver.location(), parcel) {
+            match sender.post(attempt(), &receiver.location(), parcel) {
                 Ok(()) => true,
                 Err(error) => {
                     assert_eq!(error.fault, TransportErrorKind::Congested);
@@ -256,7 +255,7 @@ fn a_failed_open_neither_blocks_nor_affects_other_endpoints() {
     assert!(matches!(again.unwrap_err(), ShmError::File { .. }));
     let (other, sink) = domain.listening();
     other
-        .dispatch(attempt(), &one.location(), parcel(Bytes::new()))
+        .post(attempt(), &one.location(), parcel(Bytes::new()))
         .unwrap();
     until("answer", || sink.conclusions() == 1);
 }
@@ -270,7 +269,7 @@ fn a_stopped_lock_holder_blocks_neither_dispatch_nor_close() {
     let stopped = domain.locked();
     let (refused, unsent) = (attempt(), attempt());
     other
-        .dispatch(refused, &one.location(), parcel(Bytes::new()))
+        .post(refused, &one.location(), parcel(Bytes::new()))
         .unwrap();
     until("conclusion", || sink.conclusion_of(refused).is_some());
     match sink.conclusion_of(refused) {
@@ -281,7 +280,7 @@ fn a_stopped_lock_holder_blocks_neither_dispatch_nor_close() {
         end => panic!("{end:?}"),
     }
     other
-        .dispatch(unsent, &one.location(), parcel(Bytes::new()))
+        .post(unsent, &one.location(), parcel(Bytes::new()))
         .unwrap();
     let (done, finished) = mpsc::channel();
     std::thread::spawn(move || {
@@ -309,19 +308,19 @@ fn parcels_that_wait_for_an_open_mailbox_are_bounded() {
     let (sender, sink) = domain.listening_with(config.clone());
     let (many, large) = (domain.listening(), domain.listening());
     let stopped = domain.locked();
-    let dispatch = |to: &ShmTransport, content: usize| {
+    let post = |to: &ShmTransport, content: usize| {
         let parcel = parcel(vec![1; content].into());
-        sender.dispatch(attempt(), &to.location(), parcel)
+        sender.post(attempt(), &to.location(), parcel)
     };
     for _ in 0..config.window {
-        dispatch(&many.0, 10).unwrap();
+        post(&many.0, 10).unwrap();
     }
-    let refused = dispatch(&many.0, 10).unwrap_err();
+    let refused = post(&many.0, 10).unwrap_err();
     assert_eq!(refused.fault, TransportErrorKind::Congested);
-    dispatch(&large.0, 60_000).unwrap();
-    let refused = dispatch(&large.0, 60_000).unwrap_err();
+    post(&large.0, 60_000).unwrap();
+    let refused = post(&large.0, 60_000).unwrap_err();
     assert_eq!(refused.fault, TransportErrorKind::Congested);
-    dispatch(&large.0, 10_000).unwrap();
+    post(&large.0, 10_000).unwrap();
     drop(stopped);
     until("conclusions", || sink.conclusions() == config.window + 2);
 }
@@ -334,7 +333,7 @@ fn parcels_that_wait_for_the_mailbox_of_a_process_that_ends_are_not_sent() {
     let stopped = domain.locked();
     let one = attempt();
     sender
-        .dispatch(one, &receiver.location(), parcel(Bytes::new()))
+        .post(one, &receiver.location(), parcel(Bytes::new()))
         .unwrap();
     receiver.close();
     until("conclusion", || sink.conclusion_of(one).is_some());
@@ -353,17 +352,17 @@ fn a_letter_that_needs_memory_waits_for_a_process_that_allocates_some() {
         let domain = TestDomain::new();
         let (sender, sink) = domain.listening();
         let (receiver, got) = domain.listening();
-        let dispatch = |content: usize| {
+        let post = |content: usize| {
             let (one, content) = (attempt(), vec![2; content].into());
             sender
-                .dispatch(one, &receiver.location(), parcel(content))
+                .post(one, &receiver.location(), parcel(content))
                 .unwrap();
             one
         };
-        let first = dispatch(10);
+        let first = post(10);
         until("answer", || sink.conclusion_of(first).is_some());
         let allocating = domain.memory_locked();
-        let (large, small) = (dispatch(300_000), dispatch(10));
+        let (large, small) = (post(300_000), post(10));
         // Allocates no memory, so it is on the heap.
         assert!(sender.loan(&receiver.location(), 100, 400_000, 1).is_err());
         assert!(sender.loan_for_many(400_000).is_err());
@@ -419,11 +418,7 @@ fn send_until_accepted(from: (&ShmTransport, &RecordingSink), to: &ShmTransport)
     until("an accepted letter", || {
         let one = attempt();
         let content = Bytes::from(vec![3; 9000]);
-        if from
-            .0
-            .dispatch(one, &to.location(), parcel(content))
-            .is_err()
-        {
+        if from.0.post(one, &to.location(), parcel(content)).is_err() {
             return false;
         }
         until("conclusion", || from.1.conclusion_of(one).is_some());

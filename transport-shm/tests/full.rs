@@ -88,7 +88,7 @@ fn inside_a_full_file_system_ends_no_process() {
     let one = attempt();
     let content = vec![1; 300_000].into();
     sender
-        .dispatch(one, &receiver.location(), parcel(content))
+        .post(one, &receiver.location(), parcel(content))
         .unwrap();
     until("answer", || sink.conclusion_of(one).is_some());
     let accepted = Some(Conclusion::Answered(Answer::Accepted));
@@ -290,7 +290,6 @@ fn send(from: &ShmTransport, root: &str, prefix: &str, rng: &mut Rng) -> Result<
             None => vec![3; len].into(),
         },
     };
-    from.dispatch(attempt(), &to, parcel(content))
-        .map_err(|_| ())?;
+    from.post(attempt(), &to, parcel(content)).map_err(|_| ())?;
     Ok(true)
 }

@@ -53,7 +53,7 @@ fn deferring(domain: &TestDomain) -> (ShmTransport, Arc<DeferringSink>) {
 fn send(from: &ShmTransport, to: &ShmTransport, content: &Bytes) -> AttemptId {
     let attempt = attempt();
     let parcel = parcel(content.clone());
-    from.dispatch(attempt, &to.location(), parcel).unwrap();
+    from.post(attempt, &to.location(), parcel).unwrap();
     attempt
 }
 

@@ -35,7 +35,7 @@ fn segments(domain: &TestDomain) -> (usize, u64) {
 
 fn send(from: &ShmTransport, sink: &RecordingSink, to: &ShmTransport, content: &Bytes) {
     let one = attempt();
-    from.dispatch(one, &to.location(), parcel(content.clone()))
+    from.post(one, &to.location(), parcel(content.clone()))
         .unwrap();
     until("answer", || sink.conclusion_of(one).is_some());
     let accepted = Some(Conclusion::Answered(Answer::Accepted));

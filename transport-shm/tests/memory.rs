@@ -39,7 +39,7 @@ fn loaned_content_is_never_copied() {
         );
 
         sender
-            .dispatch(attempt(), &receiver.location(), parcel(content.clone()))
+            .post(attempt(), &receiver.location(), parcel(content.clone()))
             .unwrap();
         until("letter", || got.arrivals() == number + 1);
         let received = got.content(number);
@@ -71,7 +71,7 @@ fn loaned_content_can_be_sent_again_and_to_another_receiver() {
     let content = loan.freeze();
     for to in [&first, &first, &second] {
         sender
-            .dispatch(attempt(), &to.location(), parcel(content.clone()))
+            .post(attempt(), &to.location(), parcel(content.clone()))
             .unwrap();
     }
     until("letters", || {
@@ -102,7 +102,7 @@ fn a_letter_with_a_longer_front_than_announced_is_copied() {
         .unwrap();
     loan.content_mut().copy_from_slice(&pattern(5000));
     sender
-        .dispatch(attempt(), &receiver.location(), parcel(loan.freeze()))
+        .post(attempt(), &receiver.location(), parcel(loan.freeze()))
         .unwrap();
     until("letter", || got.arrivals() == 1);
     assert_eq!(got.content(0), pattern(5000));
@@ -127,7 +127,7 @@ fn a_loan_outlives_larger_ones_and_its_transport() {
         .unwrap()
         .unwrap();
     sender
-        .dispatch(attempt(), &receiver.location(), parcel(small.clone()))
+        .post(attempt(), &receiver.location(), parcel(small.clone()))
         .unwrap();
     until("letter", || got.arrivals() == 1);
     assert_eq!(got.content(0), pattern(2000));
@@ -153,9 +153,7 @@ fn loans_are_bounded_and_leave_room_for_letters() {
         .err()
         .expect("the limit is reached");
     assert_eq!(refused.fault, TransportErrorKind::Congested);
-    sender
-        .dispatch(attempt(), &to, parcel(Bytes::new()))
-        .unwrap();
+    sender.post(attempt(), &to, parcel(Bytes::new())).unwrap();
     until("answer", || sent.conclusions() == 1);
     drop(loans);
     assert!(sender.loan(&to, FRONT, 100, 1).is_ok());
@@ -173,7 +171,7 @@ fn held_content_is_bounded_and_then_copied() {
     for number in 0..40 {
         let one = attempt();
         sender
-            .dispatch(one, &to, parcel(pattern(3000 + number)))
+            .post(one, &to, parcel(pattern(3000 + number)))
             .unwrap();
         until("answer", || sent.conclusion_of(one).is_some());
         assert_eq!(
@@ -191,9 +189,7 @@ fn held_content_is_bounded_and_then_copied() {
     }
     got.arrived.lock().unwrap().clear();
     assert_eq!(receiver.counters().borrowed, 0);
-    sender
-        .dispatch(attempt(), &to, parcel(pattern(3000)))
-        .unwrap();
+    sender.post(attempt(), &to, parcel(pattern(3000))).unwrap();
     until("letter", || got.arrivals() == 1);
     assert_eq!(receiver.counters().in_place, 6);
 }
@@ -209,7 +205,7 @@ fn one_slot_of_each_sender_stays_free() {
     for _ in 0..12 {
         let one = attempt();
         sender
-            .dispatch(one, &receiver.location(), parcel(pattern(2000)))
+            .post(one, &receiver.location(), parcel(pattern(2000)))
             .unwrap();
         until("answer", || sent.conclusion_of(one).is_some());
     }
@@ -223,7 +219,7 @@ fn small_content_is_copied_and_holds_no_slot() {
     let (receiver, got) = domain.listening();
     let (sender, _) = domain.listening();
     sender
-        .dispatch(attempt(), &receiver.location(), parcel(pattern(10)))
+        .post(attempt(), &receiver.location(), parcel(pattern(10)))
         .unwrap();
     until("letter", || got.arrivals() == 1);
     assert_eq!(got.content(0), pattern(10));
@@ -241,20 +237,20 @@ fn exceeding_the_capacity_is_an_error_and_not_a_signal() {
     let to = receiver.location();
     // The first letter to a process is sent after its mailbox has been opened.
     let one = attempt();
-    sender.dispatch(one, &to, parcel(pattern(9 << 20))).unwrap();
+    sender.post(one, &to, parcel(pattern(9 << 20))).unwrap();
     until("conclusion", || sent.conclusion_of(one).is_some());
     match sent.conclusion_of(one) {
         Some(Conclusion::NotSent(error)) => assert_eq!(error.fault, TransportErrorKind::TooLarge),
         end => panic!("{end:?}"),
     }
     let refused = sender
-        .dispatch(attempt(), &to, parcel(pattern(9 << 20)))
+        .post(attempt(), &to, parcel(pattern(9 << 20)))
         .unwrap_err();
     assert_eq!(refused.fault, TransportErrorKind::TooLarge);
     // The receiver keeps every letter, so each one takes new memory.
     let mut taken = 1;
     let refused = loop {
-        match sender.dispatch(attempt(), &to, parcel(pattern(1 << 20))) {
+        match sender.post(attempt(), &to, parcel(pattern(1 << 20))) {
             Ok(()) => taken += 1,
             Err(e) => break e,
         }
@@ -264,9 +260,7 @@ fn exceeding_the_capacity_is_an_error_and_not_a_signal() {
     assert!(taken > 2, "{taken}");
     assert_eq!(refused.fault, TransportErrorKind::NoRoom);
     assert!(refused.detail.contains("capacity"), "{refused}");
-    sender
-        .dispatch(attempt(), &to, parcel(pattern(500)))
-        .unwrap();
+    sender.post(attempt(), &to, parcel(pattern(500))).unwrap();
     until("answer", || sent.conclusions() == taken + 1);
 }
 
@@ -276,7 +270,7 @@ fn content_outlives_both_transports() {
     let (receiver, got) = domain.listening();
     let (sender, _) = domain.listening();
     sender
-        .dispatch(attempt(), &receiver.location(), parcel(pattern(100_000)))
+        .post(attempt(), &receiver.location(), parcel(pattern(100_000)))
         .unwrap();
     until("letter", || got.arrivals() == 1);
     let content = got.content(0);

@@ -76,7 +76,7 @@ impl Process {
     fn wait_until_up(&self, from: &ShmTransport) {
         let to = location_of(self.incarnation);
         until("process", || {
-            from.dispatch(attempt(), &to, parcel(Bytes::new())).is_ok()
+            from.post(attempt(), &to, parcel(Bytes::new())).is_ok()
         });
     }
 }
@@ -131,12 +131,12 @@ fn process_entry() {
                     continue;
                 };
                 loan.content_mut().fill(7);
-                let _ = endpoint.dispatch(attempt(), &to, parcel(loan.freeze()));
+                let _ = endpoint.post(attempt(), &to, parcel(loan.freeze()));
             }
             _ => {
                 // The mailbox is full, or its process has ended.
                 if endpoint
-                    .dispatch(attempt(), &to, parcel(content.clone()))
+                    .post(attempt(), &to, parcel(content.clone()))
                     .is_err()
                 {
                     std::thread::yield_now();
@@ -178,7 +178,7 @@ fn receivers_in_two_processes_read_the_same_memory() {
     for receiver in &mut receivers {
         let to = location_of(receiver.incarnation);
         let one = attempt();
-        sender.dispatch(one, &to, parcel(content.clone())).unwrap();
+        sender.post(one, &to, parcel(content.clone())).unwrap();
         until("answer", || sent.conclusion_of(one).is_some());
         let mut lines = receiver.lines().map_while(Result::ok);
         let reported = lines.find(|line| line.starts_with("POSITION"));
@@ -235,7 +235,7 @@ fn attempts_to_a_killed_receiver_are_concluded() {
     let attempts: Vec<_> = (0..5).map(|_| attempt()).collect();
     for one in &attempts {
         sender
-            .dispatch(*one, &to, parcel(vec![1; 3000].into()))
+            .post(*one, &to, parcel(vec![1; 3000].into()))
             .unwrap();
     }
     receiver.kill();
@@ -247,7 +247,7 @@ fn attempts_to_a_killed_receiver_are_concluded() {
         }
     }
     let refused = sender
-        .dispatch(attempt(), &to, parcel(Bytes::new()))
+        .post(attempt(), &to, parcel(Bytes::new()))
         .unwrap_err();
     assert_eq!(refused.fault, TransportErrorKind::Unreachable);
     assert_eq!(sender.counters().peers_gone, 1);
@@ -287,7 +287,7 @@ fn wait_until_answered_in_a_word(sender: &ShmTransport, sink: &RecordingSink, to
     until("an answer in a word", || {
         let one = attempt();
         sender
-            .dispatch(one, &location_of(to), parcel(Bytes::new()))
+            .post(one, &location_of(to), parcel(Bytes::new()))
             .unwrap();
         until("answer", || sink.conclusion_of(one).is_some());
         sender.counters().answered_in_words > before
@@ -305,7 +305,7 @@ fn a_letter_whose_receiver_is_killed_before_its_answer_is_unconfirmed() {
     let to = location_of(receiver.incarnation);
     let [taken, waiting] = [attempt(), attempt()];
     for (one, content) in [(taken, vec![1; 3000]), (waiting, vec![])] {
-        sender.dispatch(one, &to, parcel(content.into())).unwrap();
+        sender.post(one, &to, parcel(content.into())).unwrap();
     }
     let mut lines = receiver.lines().map_while(Result::ok);
     assert!(lines.any(|line| line == "HALTED"));
@@ -332,18 +332,18 @@ fn a_letter_whose_receiver_is_killed_after_its_answer_is_answered() {
     receiver.wait_until_up(&sender);
     wait_until_answered_in_a_word(&sender, sent, receiver.incarnation);
     let to = location_of(receiver.incarnation);
-    let dispatch = |content: Vec<u8>| {
+    let post = |content: Vec<u8>| {
         let one = attempt();
-        sender.dispatch(one, &to, parcel(content.into())).unwrap();
+        sender.post(one, &to, parcel(content.into())).unwrap();
         one
     };
     sink.close_gate();
-    dispatch(vec![]);
+    post(vec![]);
     until("the first conclusion", || sink.is_waiting());
     let before = sender.counters().answered_in_words;
-    let answered = dispatch(vec![]);
+    let answered = post(vec![]);
     // When this letter has arrived, the one before it is answered.
-    dispatch(vec![1; 3000]);
+    post(vec![1; 3000]);
     let mut lines = receiver.lines().map_while(Result::ok);
     assert!(lines.any(|line| line.starts_with("POSITION")));
     receiver.kill();
@@ -399,7 +399,7 @@ fn a_receiver_survives_more_killed_senders_than_it_has_connections() {
     let (sender, sent) = domain.listening();
     let one = attempt();
     sender
-        .dispatch(one, &receiver.location(), parcel(vec![1; 5000].into()))
+        .post(one, &receiver.location(), parcel(vec![1; 5000].into()))
         .unwrap();
     until("answer", || sent.conclusion_of(one).is_some());
     assert_eq!(
@@ -451,9 +451,7 @@ fn close_waits_until_the_last_letters_are_taken() {
     let to = location_of(receiver.incarnation);
     for number in 0..4 {
         let one = attempt();
-        sender
-            .dispatch(one, &to, parcel(vec![1; 3000].into()))
-            .unwrap();
+        sender.post(one, &to, parcel(vec![1; 3000].into())).unwrap();
         if number % 2 == 0 {
             sender.abandon(one, &to);
         }
@@ -513,7 +511,7 @@ fn a_connection_without_ports_is_removed() {
         let one = attempt();
         let content = vec![1; 5000].into();
         sender
-            .dispatch(one, &receiver.location(), parcel(content))
+            .post(one, &receiver.location(), parcel(content))
             .unwrap();
         until("answer", || sent.conclusion_of(one).is_some());
         assert_eq!(
@@ -584,7 +582,7 @@ fn a_cleanup_without_free_descriptors_keeps_the_files_of_living_processes() {
     let exchange = || {
         let (sender, sink) = domain.listening();
         let (to, sent) = (receiver.location(), attempt());
-        sender.dispatch(sent, &to, parcel(Bytes::new())).unwrap();
+        sender.post(sent, &to, parcel(Bytes::new())).unwrap();
         until("answer", || sink.conclusion_of(sent).is_some());
         sender
     };
@@ -678,7 +676,7 @@ fn descriptions_that_a_crash_of_the_system_has_emptied_are_removed() {
     // Processes start, and reach each other.
     let (one, sink) = domain.listening();
     let (other, _) = domain.listening();
-    one.dispatch(attempt(), &other.location(), parcel(Bytes::new()))
+    one.post(attempt(), &other.location(), parcel(Bytes::new()))
         .unwrap();
     until("an answer", || sink.conclusions() == 1);
     other.close();

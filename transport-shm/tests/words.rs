@@ -20,9 +20,9 @@ use fipa_transport_shm::ShmTransport;
 /// Number of words of a process.
 const WORDS: usize = 54;
 
-fn dispatch(from: &ShmTransport, to: &ShmTransport, content: &Bytes) -> AttemptId {
+fn post(from: &ShmTransport, to: &ShmTransport, content: &Bytes) -> AttemptId {
     let attempt = attempt();
-    from.dispatch(attempt, &to.location(), parcel(content.clone()))
+    from.post(attempt, &to.location(), parcel(content.clone()))
         .unwrap();
     attempt
 }
@@ -44,7 +44,7 @@ fn send_until_answered_in_a_word(
 ) {
     let before = sender.counters().answered_in_words;
     until("an answer in a word", || {
-        let attempt = dispatch(sender, receiver, &Bytes::new());
+        let attempt = post(sender, receiver, &Bytes::new());
         assert_eq!(conclusion(sent, attempt), accepted());
         sender.counters().answered_in_words > before
     });
@@ -112,7 +112,7 @@ fn answers_without_data_need_no_response() {
         *sink.answer.lock().unwrap() = answer.clone();
         for content in [content(10), content(5000), loaned(), shared()] {
             let before = sender.counters().answered_in_words;
-            let sent_now = dispatch(&sender, &receiver, &content);
+            let sent_now = post(&sender, &receiver, &content);
             let answered = Conclusion::Answered(answer.clone());
             assert_eq!(conclusion(&sent, sent_now), answered);
             let in_words = sender.counters().answered_in_words - before;
@@ -135,7 +135,7 @@ fn content_in_place_is_refused_with_a_response() {
     for _ in 0..3 * domain.config().window {
         sink.held.lock().unwrap().clear();
         let content = Bytes::from(vec![7; 5000]);
-        let attempt = dispatch(&sender, &receiver, &content);
+        let attempt = post(&sender, &receiver, &content);
         let answered = Conclusion::Answered(Answer::OutOfOrder { last: 3 });
         assert_eq!(conclusion(&sent, attempt), answered);
         match &sink.held.lock().unwrap()[0].parcel.body {
@@ -161,11 +161,11 @@ fn without_a_free_word_a_response_answers() {
     let mut unanswered = Vec::new();
     for one in &silent {
         open(&sender, &one.location());
-        unanswered.extend((0..window).map(|_| dispatch(&sender, one, &Bytes::new())));
+        unanswered.extend((0..window).map(|_| post(&sender, one, &Bytes::new())));
     }
     let before = sender.counters().answered_in_words;
     for _ in 0..3 {
-        let attempt = dispatch(&sender, &receiver, &Bytes::new());
+        let attempt = post(&sender, &receiver, &Bytes::new());
         assert_eq!(conclusion(&sent, attempt), accepted());
     }
     assert_eq!(sender.counters().answered_in_words, before);
@@ -175,7 +175,7 @@ fn without_a_free_word_a_response_answers() {
         let end = conclusion(&sent, attempt);
         assert!(matches!(end, Conclusion::Unconfirmed(_)), "{end:?}");
     }
-    let attempt = dispatch(&sender, &receiver, &Bytes::new());
+    let attempt = post(&sender, &receiver, &Bytes::new());
     assert_eq!(conclusion(&sent, attempt), accepted());
     assert_eq!(sender.counters().answered_in_words, before + 1);
 }
@@ -212,14 +212,14 @@ fn a_late_answer_to_an_abandoned_letter_is_not_that_to_the_next_one() {
             let late_waits = late_sink.arrived.lock().unwrap();
             let next_waits = next_sink.arrived.lock().unwrap();
             let taken = late.counters().arrived;
-            let abandoned = dispatch(&sender, late, &Bytes::new());
+            let abandoned = post(&sender, late, &Bytes::new());
             until("the letter", || late.counters().arrived > taken);
             let end = sender.abandon(abandoned, &late.location());
             assert_eq!(end, Abandoned::Unconfirmed);
-            let following = dispatch(&sender, next, &Bytes::new());
+            let following = post(&sender, next, &Bytes::new());
             drop(late_waits);
             // The answer to a later letter shows that the first one has its answer.
-            let third = dispatch(&sender, late, &Bytes::new());
+            let third = post(&sender, late, &Bytes::new());
             answer_to(third);
             assert_eq!(sent.conclusion_of(following), None);
             assert_eq!(sent.conclusion_of(abandoned), None);
@@ -251,7 +251,7 @@ fn a_sender_that_stops_polling_finds_the_answer() {
     for _ in 0..20 {
         let before = sender.counters().answered_in_words;
         sink.close_gate();
-        let first = dispatch(&sender, &receiver, &Bytes::new());
+        let first = post(&sender, &receiver, &Bytes::new());
         std::thread::scope(|scope| {
             let driving = scope.spawn(|| {
                 while sent.conclusion_of(first).is_none() {
@@ -263,7 +263,7 @@ fn a_sender_that_stops_polling_finds_the_answer() {
                 sink.is_waiting()
             });
             let (rung, arrived) = (receiver.counters().rung, receiver.counters().arrived);
-            let second = dispatch(&sender, &receiver, &Bytes::new());
+            let second = post(&sender, &receiver, &Bytes::new());
             until("the second letter", || {
                 receiver.drive();
                 receiver.counters().arrived > arrived
@@ -289,13 +289,13 @@ fn a_receiver_does_not_answer_on_the_earlier_page_of_a_sender() {
     for _ in 0..3 {
         send_until_answered_in_a_word((&sender, &sent), &receiver);
         let waits = received.arrived.lock().unwrap();
-        let before = dispatch(&sender, &receiver, &Bytes::new());
+        let before = post(&sender, &receiver, &Bytes::new());
         std::fs::remove_file(&sender.files()[0]).unwrap();
         assert!(sender.rejoin().unwrap());
         let end = conclusion(&sent, before);
         assert!(matches!(end, Conclusion::Unconfirmed(_)), "{end:?}");
         open(&sender, &receiver.location());
-        let after = dispatch(&sender, &receiver, &Bytes::new());
+        let after = post(&sender, &receiver, &Bytes::new());
         drop(waits);
         assert_eq!(conclusion(&sent, after), accepted());
     }

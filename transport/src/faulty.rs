@@ -20,7 +20,7 @@ use crate::{
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Fault {
-    /// The dispatch fails at once; nothing is sent.
+    /// `post` fails at once; nothing is sent.
     Unreachable,
     /// The parcel is lost; the attempt concludes as unconfirmed.
     Lost,
@@ -65,7 +65,7 @@ impl fmt::Debug for Faulty {
 }
 
 impl Faulty {
-    /// Wraps `inner`. Each dispatch gets one of the faults with its rate (0 to 1), drawn from
+    /// Wraps `inner`. Each `post` gets one of the faults with its rate (0 to 1), drawn from
     /// `seed`.
     pub fn new(inner: Arc<dyn Transport>, seed: u64, rates: &[(Fault, f64)]) -> Self {
         let random = fastrand::Rng::with_seed(seed);
@@ -85,7 +85,7 @@ impl Faulty {
         }
     }
 
-    /// Forces this fault for every dispatch from now on; `None` returns to drawn faults.
+    /// Forces this fault for every `post` from now on; `None` returns to drawn faults.
     pub fn force(&self, fault: Option<Fault>) {
         self.shared.plan.lock().forced = fault;
     }
@@ -136,7 +136,7 @@ impl Transport for Faulty {
         }))
     }
 
-    fn dispatch(
+    fn post(
         &self,
         attempt: AttemptId,
         to: &Location,
@@ -161,13 +161,13 @@ impl Transport for Faulty {
                     .pending
                     .lock()
                     .insert(attempt, Fault::AnswerLost);
-                let sent = self.inner.dispatch(attempt, to, parcel);
+                let sent = self.inner.post(attempt, to, parcel);
                 if sent.is_err() {
                     self.shared.pending.lock().remove(&attempt);
                 }
                 sent
             }
-            None => self.inner.dispatch(attempt, to, parcel),
+            None => self.inner.post(attempt, to, parcel),
         }
     }
 

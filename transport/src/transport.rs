@@ -5,7 +5,6 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use fipa_acl::Letter;
-use serde::Serialize;
 
 use crate::error::{ListenError, TransportError};
 use crate::principal::Principal;
@@ -16,7 +15,7 @@ use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 /// A transport tries once and reports. It keeps these rules, which the module `conformance` (feature
 /// of that name) checks:
 ///
-/// 1. **One conclusion.** Every [`dispatch`](Self::dispatch) that returned `Ok` has exactly one
+/// 1. **One conclusion.** Every [`post`](Self::post) that returned `Ok` has exactly one
 ///    conclusion: by [`Sink::concluded`], or at once by [`abandon`](Self::abandon).
 /// 2. **Honest conclusions.** [`Conclusion::NotSent`] and [`Abandoned::NotSent`] mean that no byte
 ///    of the parcel has reached the other side, and that none will. In doubt, the conclusion is
@@ -26,9 +25,9 @@ use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 ///    sink has returned it; the transport acknowledges nothing on its behalf. The sink gets the
 ///    parcel of an attempt once. If a copy reaches it all the same, its verdict does not answer the
 ///    attempt.
-/// 4. **Order.** Letters of one stream that are dispatched to one location arrive in the order of the calls, or do
+/// 4. **Order.** Letters of one stream that are posted to one location arrive in the order of the calls, or do
 ///    not arrive.
-/// 5. **No callback from a call.** The transport does not call a sink from within `dispatch`,
+/// 5. **No callback from a call.** The transport does not call a sink from within `post`,
 ///    `abandon` or `answer`, because the caller may hold its own lock. It may call the sink from
 ///    within [`drive`](Self::drive) and `listen`.
 /// 6. **Bounded.** A parcel without room is returned as an error, and not queued without limit. Letters
@@ -40,7 +39,7 @@ use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 ///
 /// No method blocks. Methods may be called from any thread.
 pub trait Transport: Send + Sync + 'static {
-    /// The kind of this transport. Locations of this kind are dispatched to it.
+    /// The kind of this transport. Locations of this kind are posted to it.
     fn kind(&self) -> Kind;
 
     /// Maximum length of a letter in bytes. A longer one fails with [`TransportErrorKind::TooLarge`].
@@ -57,15 +56,11 @@ pub trait Transport: Send + Sync + 'static {
     ///
     /// # Errors
     /// Returns an error if the parcel cannot be sent. No conclusion follows then.
-    fn dispatch(
-        &self,
-        attempt: AttemptId,
-        to: &Location,
-        parcel: Parcel,
-    ) -> Result<(), TransportError>;
+    fn post(&self, attempt: AttemptId, to: &Location, parcel: Parcel)
+    -> Result<(), TransportError>;
 
     /// Ends an attempt and concludes it at once: its resources are released, and
-    /// [`Sink::concluded`] is not called for it. `to` is the location to which it was dispatched.
+    /// [`Sink::concluded`] is not called for it. `to` is the location to which it was posted.
     /// Returns [`Abandoned::Unconfirmed`] for an unknown attempt.
     fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned;
 
@@ -115,14 +110,14 @@ pub trait Transport: Send + Sync + 'static {
         Ok(None)
     }
 
-    /// Whether dispatching this content to several locations makes a copy for each of them that
+    /// Whether posting this content to several locations makes a copy for each of them that
     /// [`loan_for_many`](Self::loan_for_many) would avoid.
     fn copies_for_each(&self, content: &Bytes) -> bool {
         let _ = content;
         false
     }
 
-    /// Stops listening, concludes every open attempt and releases all resources. Later dispatches
+    /// Stops listening, concludes every open attempt and releases all resources. Later calls of `post`
     /// fail. May be called repeatedly.
     fn close(&self);
 }
@@ -133,7 +128,7 @@ pub trait LoanedContent: Send {
     fn content_mut(&mut self) -> &mut [u8];
 
     /// Returns the bytes as content of a letter. The transport that loaned them recognizes them in
-    /// a dispatch to a location they were loaned for, and copies nothing.
+    /// posting to a location they were loaned for, and copies nothing.
     fn freeze(self: Box<Self>) -> Bytes;
 }
 
@@ -182,7 +177,7 @@ pub trait Sink: Send + Sync {
     }
 
     /// Whether an agent of this host has the name. Other platforms reach such an agent at the addresses of this
-    /// service. May read files, so it is not called while a parcel is dispatched.
+    /// service. May read files, so it is not called while a parcel is posted.
     fn is_here(&self, name: &str) -> bool {
         let _ = name;
         false
@@ -423,7 +418,7 @@ pub enum Conclusion {
     Unconfirmed(TransportError),
 }
 
-/// Identifies a dispatch. Chosen by the caller.
+/// Identifies an attempt to post a parcel. Chosen by the caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct AttemptId(pub u64);
 

@@ -76,7 +76,7 @@ impl Transport for TableTransport {
         Ok(vec![endpoint.location.clone()])
     }
 
-    fn dispatch(
+    fn post(
         &self,
         attempt: AttemptId,
         to: &Location,
@@ -282,7 +282,7 @@ mod faults {
         let to = receiver.listen(at_receiver.clone()).unwrap().remove(0);
         let attempt = |number: u64, fault| {
             sender.force(Some(fault));
-            let result = sender.dispatch(AttemptId(number), &to, credit());
+            let result = sender.post(AttemptId(number), &to, credit());
             while receiver.drive() || sender.drive() {}
             result
         };
@@ -323,7 +323,7 @@ mod faults {
                 .unwrap()
                 .remove(0);
             (0..40)
-                .map(|n| sender.dispatch(AttemptId(n), &to, credit()).is_ok())
+                .map(|n| sender.post(AttemptId(n), &to, credit()).is_ok())
                 .collect::<Vec<_>>()
         };
         assert_eq!(run(3), run(3));

@@ -119,7 +119,7 @@ impl Both {
         };
         self.next += 1;
         let attempt = AttemptId(self.next);
-        let dispatched = self.endpoint.dispatch(attempt, to, parcel(content));
+        let dispatched = self.endpoint.post(attempt, to, parcel(content));
         dispatched.map_err(chain_text)?;
         Ok((attempt, began))
     }

@@ -80,7 +80,7 @@ impl Crowd {
 
     #[inline]
     fn send_and(&mut self, receiver: &Arc<str>, next: impl Fn(&mut Core) -> Option<Action>) {
-        self.core.send(
+        self.core.submit(
             self.now,
             Submission {
                 sender: ROVER,

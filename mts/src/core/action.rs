@@ -7,7 +7,7 @@ use fipa_transport::{
     TransportErrorKind,
 };
 
-use super::ids::SendId;
+use super::ids::SubmissionId;
 use super::notice::Notice;
 
 /// An action that the runtime performs for the delivery core.
@@ -45,7 +45,7 @@ pub enum Action {
     /// One receiver's outcome of a letter sent here.
     Outcome {
         /// The submission.
-        send: SendId,
+        send: SubmissionId,
         /// The receiver.
         receiver: Arc<str>,
         /// The outcome.
@@ -91,11 +91,11 @@ pub enum Action {
         /// Later refreshes have greater numbers.
         number: u64,
     },
-    /// The number of outcomes of a letter for which [`Core::send`](super::Core::send) has returned
+    /// The number of outcomes of a letter for which [`Core::submit`](super::Core::submit) has returned
     /// none.
     Resolved {
         /// The submission.
-        send: SendId,
+        send: SubmissionId,
         /// Number of outcomes, of which some may have been reported already.
         outcomes: usize,
     },

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use fipa_sds::Entry;
 use fipa_transport::{Incarnation, Stream};
 
-/// Identifies a call of [`Core::send`] in its outcomes.
+/// Identifies a call of [`Core::submit`] in its outcomes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct SendId(pub u64);
+pub struct SubmissionId(pub u64);
 
 /// The number of a lane within its core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]

@@ -7,7 +7,7 @@
 //!
 //! What goes in:
 //!
-//! * `send`: letters of agents of this process; their receivers are looked up.
+//! * `submit`: letters of agents of this process; their receivers are looked up.
 //! * `arrival`: parcels from other services; unknown receivers are refused.
 //! * `unframed`: letters of legacy peers.
 //! * `network`: changes of the directory, of connections, of trust.
@@ -73,8 +73,8 @@ mod route_report;
 mod routes;
 #[doc(hidden)]
 pub mod rules;
-mod send;
 mod settlement;
+mod submit;
 mod tally;
 mod undelivered;
 mod unframed;
@@ -96,7 +96,7 @@ pub use self::action::Action;
 use self::attempts::{AttemptTable, Purpose};
 pub use self::config::{CoreConfig, MAX_DEADLINE};
 pub use self::failures::Undecodable;
-pub use self::ids::SendId;
+pub use self::ids::SubmissionId;
 use self::ids::{LaneId, LaneKey};
 use self::inbox::Inbox;
 pub use self::inbox::Received;
@@ -110,7 +110,7 @@ pub use self::peers::{Peer, PeerState};
 use self::principals::Principals;
 pub use self::reading::{LetterReader, ReadLetter};
 pub use self::route_report::{Route, RouteCandidate, RouteState, Standing};
-pub use self::send::Submission;
+pub use self::submit::Submission;
 pub use self::unframed::Unframed;
 use self::waiting::{Unresolved, WaitingLetters};
 use crate::{AccessGate, Map};

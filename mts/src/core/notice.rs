@@ -5,7 +5,7 @@ use std::sync::Arc;
 use fipa_acl::Letter;
 use fipa_transport::{Kind, Outcome, Stream};
 
-use super::ids::SendId;
+use super::ids::SubmissionId;
 
 /// An event of a letter to one receiver.
 ///
@@ -29,9 +29,9 @@ pub enum News {
     /// An agent of this process sends it, or this service does: on behalf of a legacy peer, which
     /// cannot be watched, or in its own name (failure messages). Precedes the first attempt.
     Sent {
-        /// The call of [`Core::send`](super::Core::send), if any: letters of one call carry one
+        /// The call of [`Core::submit`](super::Core::submit), if any: letters of one call carry one
         /// message to several receivers.
-        send: Option<SendId>,
+        send: Option<SubmissionId>,
         /// The letter.
         letter: Letter,
     },

@@ -5,14 +5,14 @@ use std::sync::Arc;
 use fipa_transport::{Kind, LegacySource, Location, Outcome, Ticket};
 use smallvec::SmallVec;
 
-use super::ids::SendId;
+use super::ids::SubmissionId;
 use crate::failure::Failed;
 
 /// Origin of a delivery, which determines the receiver of its outcome.
 #[derive(Debug)]
 pub(crate) enum Origin {
     /// An agent of this process, which gets an outcome.
-    Local { send: SendId },
+    Local { send: SubmissionId },
     /// Other message transport services, which get a late answer or a report.
     Forwarded { upstreams: SmallVec<[Upstream; 1]> },
     /// The source at a legacy peer, which gets this in a failure message, if anything.

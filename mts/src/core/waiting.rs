@@ -9,13 +9,13 @@ use fipa_acl::Letter;
 use fipa_transport::Incarnation;
 
 use super::CoreConfig;
-use super::ids::SendId;
+use super::ids::SubmissionId;
 use crate::Map;
 
 /// A letter that was sent and whose receivers are to be resolved.
 #[derive(Debug)]
 pub(super) struct Unresolved {
-    pub(super) send: SendId,
+    pub(super) send: SubmissionId,
     pub(super) sender: Incarnation,
     pub(super) letter: Letter,
     pub(super) receivers: Vec<Arc<str>>,

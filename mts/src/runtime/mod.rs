@@ -37,7 +37,7 @@ use crate::AccessGate;
 use crate::Map;
 use crate::core::{
     Action, Core, CoreConfig, LetterReader, Notice, Now, Peer, PeerState, Received, Route,
-    RouteState, SendId, Submission, Undecodable,
+    RouteState, Submission, SubmissionId, Undecodable,
 };
 use crate::dial::listened_at;
 
@@ -189,7 +189,7 @@ struct State {
     unframed_deadline: Duration,
     /// Time at which the timer wakes up.
     armed: Option<Instant>,
-    sends: Map<SendId, Arc<Slot>>,
+    sends: Map<SubmissionId, Arc<Slot>>,
     agents: Map<Incarnation, Arc<AgentWaiter>>,
 }
 
@@ -376,15 +376,15 @@ impl Mts {
     ///
     /// Large content for several receivers is first copied to memory that all of them can read, if
     /// a transport offers that ([`Transport::loan_for_many`]).
-    pub fn send(&self, mut submission: Submission) -> Sending {
+    pub fn submit(&self, mut submission: Submission) -> Sending {
         if let Some(content) = self.content_for_many(&submission) {
             submission.letter = submission.letter.with_content(content);
         }
-        self.begin(|core, now| core.send(now, submission))
+        self.begin(|core, now| core.submit(now, submission))
     }
 
     /// Sends a letter to agents, as [`send`](Self::send) does.
-    pub fn send_to_agents(
+    pub fn submit_to_agents(
         &self,
         sender: Incarnation,
         mut letter: Letter,
@@ -396,12 +396,12 @@ impl Mts {
             let mut state = self.shared.lock();
             let now = state.clocks.now();
             let name = receiver.name();
-            match state.core.send_to_name(now, sender, letter, name, deadline) {
+            match state.core.submit_to_name(now, sender, letter, name, deadline) {
                 Ok(id) => return self.begun(state, id, Some(1)),
                 Err(back) => letter = back,
             }
         }
-        self.send(Submission {
+        self.submit(Submission {
             sender,
             letter,
             receivers: receivers.iter().map(|id| id.name().into()).collect(),
@@ -409,7 +409,7 @@ impl Mts {
         })
     }
 
-    fn begin(&self, send: impl FnOnce(&mut Core, Now) -> (SendId, Option<usize>)) -> Sending {
+    fn begin(&self, send: impl FnOnce(&mut Core, Now) -> (SubmissionId, Option<usize>)) -> Sending {
         let mut state = self.shared.lock();
         let now = state.clocks.now();
         let (id, expected) = send(&mut state.core, now);
@@ -420,7 +420,7 @@ impl Mts {
     fn begun(
         &self,
         mut state: MutexGuard<'_, State>,
-        id: SendId,
+        id: SubmissionId,
         expected: Option<usize>,
     ) -> Sending {
         let expected = expected.unwrap_or(UNRESOLVED);
@@ -465,8 +465,8 @@ impl Mts {
     }
 
     /// Sends a letter to exactly this incarnation of an agent; see [`Core::send_to`].
-    pub fn send_to(&self, submission: Submission, entry: &Entry) -> Sending {
-        self.begin(|core, now| (core.send_to(now, submission, entry), Some(1)))
+    pub fn submit_to(&self, submission: Submission, entry: &Entry) -> Sending {
+        self.begin(|core, now| (core.submit_to(now, submission, entry), Some(1)))
     }
 
     /// Replaces the orders of transports and the deadline of legacy peers' letters; see
@@ -742,7 +742,7 @@ impl Shared {
                     parcel,
                 } => {
                     let result = match self.transport(location.kind()) {
-                        Some(transport) => transport.dispatch(attempt, &location, parcel),
+                        Some(transport) => transport.post(attempt, &location, parcel),
                         None => Err(no_such_transport(location.kind())),
                     };
                     if let Err(error) = result {
@@ -878,7 +878,7 @@ impl State {
         }
     }
 
-    fn resolved(&mut self, send: SendId, outcomes: usize) {
+    fn resolved(&mut self, send: SubmissionId, outcomes: usize) {
         let Some(slot) = self.sends.get(&send) else {
             return;
         };
@@ -893,7 +893,7 @@ impl State {
         }
     }
 
-    fn outcome(&mut self, send: SendId, receiver: Arc<str>, outcome: Outcome) {
+    fn outcome(&mut self, send: SubmissionId, receiver: Arc<str>, outcome: Outcome) {
         let Some(slot) = self.sends.get(&send) else {
             return;
         };

@@ -65,7 +65,7 @@ impl Transport for Silent {
         Ok(Vec::new())
     }
 
-    fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), TransportError> {
+    fn post(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), TransportError> {
         Err(TransportError::new(TransportErrorKind::Unreachable, ""))
     }
 

@@ -17,7 +17,7 @@ use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_mts::core::{Action, Core, CoreConfig, Now, SendId};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, SubmissionId};
 use fipa_sds::{Entry, Role};
 use fipa_transport::{AttemptId, Conclusion, Incarnation, Kind, Ticket};
 use parking_lot::Mutex;
@@ -194,7 +194,7 @@ pub(crate) struct World {
     refused: Refused,
     /// Names of agents that send without a pause, and of their receivers.
     pairs: Vec<(Arc<str>, Arc<str>)>,
-    sends: Map<(usize, SendId), u64>,
+    sends: Map<(usize, SubmissionId), u64>,
     sent: BTreeMap<u64, Sent>,
     /// Letters without an outcome, by the sender's registration and the receiver's name.
     open: Map<(Incarnation, Arc<str>), BTreeSet<u64>>,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, Performative};
-use fipa_mts::core::{SendId, Submission, Undecodable};
+use fipa_mts::core::{Submission, SubmissionId, Undecodable};
 use fipa_mts::letter_for;
 use fipa_sds::Directory;
 use fipa_transport::{Incarnation, Outcome};
@@ -147,7 +147,7 @@ impl World {
         let now = self.clocks();
         let missed = known.is_none();
         let here = self.agent_on(self.processes[at].host, receiver);
-        let (send, expected) = self.processes[at].core.send(now, submission);
+        let (send, expected) = self.processes[at].core.submit(now, submission);
         self.sends.insert((at, send), number);
         let bound = Some(self.bound(size))
             .filter(|bound| self.now >= self.quiet && known.is_some() && deadline > *bound)
@@ -199,7 +199,7 @@ impl World {
     }
 
     /// The receivers of a letter are known after a refresh.
-    pub(super) fn resolved(&mut self, (at, send): (usize, SendId), outcomes: usize) {
+    pub(super) fn resolved(&mut self, (at, send): (usize, SubmissionId), outcomes: usize) {
         let Some(&number) = self.sends.get(&(at, send)) else {
             return;
         };
@@ -225,7 +225,7 @@ impl World {
 
     pub(super) fn outcome(
         &mut self,
-        sent: (usize, SendId),
+        sent: (usize, SubmissionId),
         receiver: Arc<str>,
         outcome: Outcome,
     ) -> Result<(), Breach> {

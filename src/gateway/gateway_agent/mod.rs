@@ -305,7 +305,7 @@ impl GatewayAgent {
                     deadline: ANSWER_DEADLINE,
                 };
                 // The outcome is not awaited: a requester that gets no answer asks again.
-                drop(self.service.mts.send_to(submission, to));
+                drop(self.service.mts.submit_to(submission, to));
             }
             Err(error) => {
                 log_limit::warn!(error = %ErrorChain(&error), "cannot encode a letter of the gateway")

@@ -195,7 +195,7 @@ impl<P: Protocol> Endpoint<P> {
 
     /// Calls a function of the protocol that sends to a location. It returns the number of the
     /// connection if that is new.
-    pub(crate) fn dispatch(
+    pub(crate) fn post(
         &self,
         to: &Location,
         send: impl FnOnce(&mut P, Instant) -> Result<Option<u32>, TransportError>,
@@ -543,7 +543,7 @@ mod tests {
             transfer: 0,
             body: fipa_transport::Body::Credit,
         };
-        let fresh = core.dispatch(now, attempt, &to, &parcel).unwrap().unwrap();
+        let fresh = core.post(now, attempt, &to, &parcel).unwrap().unwrap();
         endpoint.begin(&mut state, fresh, &found);
         assert_eq!(sockets(&state), 1);
         let core = state.core.as_mut().unwrap();

@@ -122,14 +122,14 @@ impl Transport for QuicTransport {
         })
     }
 
-    fn dispatch(
+    fn post(
         &self,
         attempt: AttemptId,
         to: &Location,
         parcel: Parcel,
     ) -> Result<(), TransportError> {
         self.endpoint.check(to, &parcel)?;
-        self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
+        self.endpoint.post(attempt, to, &parcel, |link, sink| {
             let (endpoint, sockets) = (self.endpoint.clone(), self.sockets.clone());
             let dialing = dial::dial(endpoint, sockets, link, sink, to.clone());
             self.endpoint.runtime.spawn(dialing)

@@ -93,7 +93,7 @@ impl TcpTransport {
     }
 
     /// Queues a letter for a legacy peer.
-    fn dispatch_legacy(
+    fn post_legacy(
         &self,
         attempt: AttemptId,
         to: &Location,
@@ -130,7 +130,7 @@ impl Transport for TcpTransport {
             })
     }
 
-    fn dispatch(
+    fn post(
         &self,
         attempt: AttemptId,
         to: &Location,
@@ -138,9 +138,9 @@ impl Transport for TcpTransport {
     ) -> Result<(), TransportError> {
         self.endpoint.check(to, &parcel)?;
         if to.signature() != Signature::Frames {
-            return self.dispatch_legacy(attempt, to, parcel);
+            return self.post_legacy(attempt, to, parcel);
         }
-        self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
+        self.endpoint.post(attempt, to, &parcel, |link, sink| {
             let dialing = dial::dial(self.endpoint.clone(), link, sink, to.clone());
             self.endpoint.runtime.spawn(dialing)
         })

@@ -187,7 +187,7 @@ impl Datagrams {
         };
         let to = to.with_incarnation(Incarnation::from_u64(service));
         let attempt = AttemptId(self.dispatched);
-        let Ok(fresh) = self.core.dispatch(now, attempt, &to, parcel) else {
+        let Ok(fresh) = self.core.post(now, attempt, &to, parcel) else {
             return;
         };
         self.dispatched += 1;

@@ -138,7 +138,7 @@ impl Transport for UdpTransport {
         })
     }
 
-    fn dispatch(
+    fn post(
         &self,
         attempt: AttemptId,
         to: &Location,
@@ -146,7 +146,7 @@ impl Transport for UdpTransport {
     ) -> Result<(), TransportError> {
         self.check(to, &parcel)?;
         self.endpoint
-            .dispatch(to, |core, now| core.dispatch(now, attempt, to, &parcel))
+            .post(to, |core, now| core.post(now, attempt, to, &parcel))
     }
 
     fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned {

@@ -101,7 +101,7 @@ impl Simulation {
         let to = to(1 - from);
         let parcel = parcel(attempt, len);
         let fresh = self.cores[from]
-            .dispatch(self.now, AttemptId(attempt), &to, &parcel)
+            .post(self.now, AttemptId(attempt), &to, &parcel)
             .map_err(|error| error.fault)?;
         if let Some(fresh) = fresh {
             let path = Path {
@@ -776,14 +776,12 @@ fn a_peer_used_at_another_location_is_pinged_at_the_old_one() {
     let peer = simulation.cores[B].own_hello(0, String::new()).identity;
     let elsewhere = Location::new(Kind::Udp, "192.0.2.99:7788").unwrap();
     let elsewhere = elsewhere.with_incarnation(peer.incarnation);
-    let fresh =
-        simulation.cores[A].dispatch(simulation.now, AttemptId(2), &elsewhere, &parcel(2, 10));
+    let fresh = simulation.cores[A].post(simulation.now, AttemptId(2), &elsewhere, &parcel(2, 10));
     assert_eq!(fresh.unwrap(), None, "over the existing connection");
     simulation.flush();
     simulation.until_concluded(A, &BTreeSet::from([1, 2]));
     assert!(simulation.now - begun <= limits.silence / 2);
-    let fresh =
-        simulation.cores[A].dispatch(simulation.now, AttemptId(3), &elsewhere, &parcel(3, 10));
+    let fresh = simulation.cores[A].post(simulation.now, AttemptId(3), &elsewhere, &parcel(3, 10));
     assert!(fresh.unwrap().is_some(), "over another connection");
 }
 

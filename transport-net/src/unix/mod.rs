@@ -236,14 +236,14 @@ impl Transport for UnixTransport {
         })
     }
 
-    fn dispatch(
+    fn post(
         &self,
         attempt: AttemptId,
         to: &Location,
         parcel: Parcel,
     ) -> Result<(), TransportError> {
         self.endpoint.check(to, &parcel)?;
-        self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
+        self.endpoint.post(attempt, to, &parcel, |link, sink| {
             let bound = self.bound.lock();
             let directory = bound.as_ref().map(|it| it.directory.clone());
             let dialing = dial::dial(self.endpoint.clone(), directory, link, sink, to.clone());

@@ -320,7 +320,7 @@ impl<T: Transport> Party<T> {
         to: &Location,
         parcel: Parcel,
     ) -> Result<(), TransportError> {
-        self.transport.dispatch(AttemptId(attempt), to, parcel)
+        self.transport.post(AttemptId(attempt), to, parcel)
     }
 
     /// Waits for the conclusion of an attempt.

@@ -59,7 +59,7 @@ pub fn an_attempt_that_is_abandoned_unsent_never_arrives(fixture: &dyn Fixture) 
         let to = &b.location;
         let sent = a
             .transport
-            .dispatch(AttemptId(attempt), to, parcel(attempt, letter(text)));
+            .post(AttemptId(attempt), to, parcel(attempt, letter(text)));
         match sent {
             Ok(()) if attempt % 3 == 0 => {
                 if a.transport.abandon(AttemptId(attempt), to) == Abandoned::NotSent {
@@ -96,7 +96,7 @@ pub fn attempts_to_a_closing_receiver_are_concluded(fixture: &dyn Fixture) {
     let mut open = Vec::new();
     for attempt in 1..=4 {
         if a.transport
-            .dispatch(
+            .post(
                 AttemptId(attempt),
                 &b.location,
                 parcel(attempt, letter("x")),
@@ -125,7 +125,7 @@ pub fn attempts_of_a_closing_sender_are_concluded(fixture: &dyn Fixture) {
     let mut open = Vec::new();
     for attempt in 0..4 {
         if a.transport
-            .dispatch(
+            .post(
                 AttemptId(attempt),
                 &b.location,
                 parcel(attempt, letter("x")),
@@ -142,18 +142,18 @@ pub fn attempts_of_a_closing_sender_are_concluded(fixture: &dyn Fixture) {
     a.transport.close();
 }
 
-/// After `close`, dispatches fail, and the location cannot be reached.
+/// After `close`, later calls of `post` fail, and the location cannot be reached.
 pub fn a_closed_transport_refuses_parcels(fixture: &dyn Fixture) {
     let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     b.transport.close();
     let error = b
         .transport
-        .dispatch(AttemptId(1), &a.location, parcel(1, letter("x")))
+        .post(AttemptId(1), &a.location, parcel(1, letter("x")))
         .expect_err("the transport is closed");
     assert_eq!(error.fault, TransportErrorKind::Closed, "{error}");
     let not_sent = match a
         .transport
-        .dispatch(AttemptId(1), &b.location, parcel(1, letter("x")))
+        .post(AttemptId(1), &b.location, parcel(1, letter("x")))
     {
         Err(_) => true,
         Ok(()) => matches!(concluded(&[&a], &a, 1), Conclusion::NotSent(_)),
@@ -196,7 +196,7 @@ pub fn no_call_waits_for_another_process(fixture: &dyn Fixture) {
     panic!("no parcel was sent after the lock was released");
 }
 
-/// Parcels that are dispatched before and while the way to a location is opened arrive in the order
+/// Parcels that are posted before and while the way to a location is opened arrive in the order
 /// of the calls, each once.
 pub fn the_first_parcels_arrive_in_order(fixture: &dyn Fixture) {
     for _ in 0..20 {
@@ -206,7 +206,7 @@ pub fn the_first_parcels_arrive_in_order(fixture: &dyn Fixture) {
         while taken.len() < 8 || a.conclusion(taken[0]).is_none() {
             attempt += 1;
             let one = parcel(attempt, letter("x"));
-            match a.transport.dispatch(AttemptId(attempt), &b.location, one) {
+            match a.transport.post(AttemptId(attempt), &b.location, one) {
                 Ok(()) => taken.push(attempt),
                 Err(error) => assert_eq!(error.fault, TransportErrorKind::Congested, "{error}"),
             }
@@ -243,7 +243,7 @@ pub fn letters_of_all_lengths_arrive_in_order(fixture: &dyn Fixture) {
         let content = vec![attempt as u8; len];
         loop {
             let one = parcel(attempt, letter(content.clone()));
-            match a.transport.dispatch(AttemptId(attempt), &b.location, one) {
+            match a.transport.post(AttemptId(attempt), &b.location, one) {
                 Ok(()) => break taken.push(attempt),
                 Err(error) => assert_eq!(error.fault, TransportErrorKind::Congested, "{error}"),
             }
@@ -270,7 +270,7 @@ pub fn letters_leave_room_for_other_parcels(fixture: &dyn Fixture) {
         attempt += 1;
         let sent = a
             .transport
-            .dispatch(AttemptId(attempt), &b.location, parcel(attempt, body));
+            .post(AttemptId(attempt), &b.location, parcel(attempt, body));
         match sent {
             Ok(()) => Some(attempt),
             Err(error) => {
@@ -395,13 +395,13 @@ pub fn shared_content_arrives_at_all_receivers(fixture: &dyn Fixture) {
     );
 }
 
-/// Each of many dispatches without a pause is refused at once or concluded, and each accepted
+/// Each of many parcels that are posted without a pause is refused at once or concluded, and each accepted
 /// parcel arrives once.
 pub fn a_flood_is_bounded_and_every_attempt_concluded(fixture: &dyn Fixture) {
     let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let mut taken = Vec::new();
     for attempt in 0..20_000 {
-        match a.transport.dispatch(
+        match a.transport.post(
             AttemptId(attempt),
             &b.location,
             parcel(attempt, letter("x")),
@@ -439,7 +439,7 @@ pub fn many_endpoints_exchange_letters_with_one(fixture: &dyn Fixture) {
     assert!(others.iter().all(|other| other.arrivals() == 20));
 }
 
-/// A sink may dispatch and abandon from within `arrived`.
+/// A sink may post and abandon from within `arrived`.
 pub fn a_sink_may_call_its_transport(fixture: &dyn Fixture) {
     type NextHop = Option<(Arc<dyn Transport>, Location)>;
     let relay: Arc<Mutex<NextHop>> = Arc::default();
@@ -450,8 +450,8 @@ pub fn a_sink_may_call_its_transport(fixture: &dyn Fixture) {
             let attempt = AttemptId(arrival.parcel.sequence);
             transport.abandon(AttemptId(u64::MAX), to);
             transport
-                .dispatch(attempt, to, arrival.parcel.clone())
-                .expect("the dispatch succeeds");
+                .post(attempt, to, arrival.parcel.clone())
+                .expect("it is posted");
         }
         Verdict::Now(Answer::Accepted)
     });
@@ -496,7 +496,7 @@ pub fn a_caller_may_hold_a_lock_that_its_sink_takes(fixture: &dyn Fixture) {
                     let _held = core.lock();
                     let parcel = parcel(attempt, letter("both ways"));
                     from.transport
-                        .dispatch(AttemptId(attempt), &to.location, parcel)
+                        .post(AttemptId(attempt), &to.location, parcel)
                         .ok()
                 });
             }

@@ -106,8 +106,8 @@ impl TestEndpoint {
 
     pub(super) fn send(&self, attempt: u64, to: &TestEndpoint, parcel: Parcel) {
         self.transport
-            .dispatch(AttemptId(attempt), &to.location, parcel)
-            .unwrap_or_else(|error| panic!("dispatch {attempt}: {error}"));
+            .post(AttemptId(attempt), &to.location, parcel)
+            .unwrap_or_else(|error| panic!("post {attempt}: {error}"));
     }
 
     pub(super) fn conclusion(&self, attempt: u64) -> Option<Conclusion> {

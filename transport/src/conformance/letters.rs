@@ -195,7 +195,7 @@ pub fn a_late_answer_concludes_its_own_parcel(fixture: &dyn Fixture) {
     }
 }
 
-/// Parcels to one location arrive in the order in which they were dispatched.
+/// Parcels to one location arrive in the order in which they were posted.
 pub fn order_is_kept(fixture: &dyn Fixture) {
     let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let total = 500;
@@ -203,7 +203,7 @@ pub fn order_is_kept(fixture: &dyn Fixture) {
         // Alternating sizes: a transport may treat short and long parcels differently.
         let content = pattern(if sequence % 7 == 0 { 40_000 } else { 20 });
         until(&[&a, &b], "room for the next parcel", || {
-            match a.transport.dispatch(
+            match a.transport.post(
                 AttemptId(sequence),
                 &b.location,
                 parcel(sequence, letter(content.clone())),
@@ -295,7 +295,7 @@ pub fn a_letter_above_the_limit_is_not_sent(fixture: &dyn Fixture) {
     );
     let error = a
         .transport
-        .dispatch(
+        .post(
             AttemptId(1),
             &b.location,
             parcel(1, letter(vec![0; limit + 1])),
@@ -312,7 +312,7 @@ pub fn a_location_without_an_endpoint_is_unreachable(fixture: &dyn Fixture) {
     let a = TestEndpoint::new(fixture);
     match a
         .transport
-        .dispatch(AttemptId(1), &fixture.nowhere(), parcel(1, letter("x")))
+        .post(AttemptId(1), &fixture.nowhere(), parcel(1, letter("x")))
     {
         Err(error) => assert_eq!(error.fault, TransportErrorKind::Unreachable, "{error}"),
         Ok(()) => match concluded(&[&a], &a, 1) {
@@ -333,7 +333,7 @@ pub fn a_letter_for_another_incarnation_is_not_delivered(fixture: &dyn Fixture) 
         .with_incarnation(Incarnation::from_u64(0xdead));
     let fault = match a
         .transport
-        .dispatch(AttemptId(1), &stale, parcel(1, letter("x")))
+        .post(AttemptId(1), &stale, parcel(1, letter("x")))
     {
         Err(error) => error.fault,
         Ok(()) => match concluded(&[&a, &b], &a, 1) {
@@ -359,7 +359,7 @@ pub fn parcels_can_be_sent_back_to_the_hop(fixture: &dyn Fixture) {
     let hop = b.sink.record.lock().arrivals[0].1.clone();
     assert_eq!(hop.location.incarnation(), a.location.incarnation());
     b.transport
-        .dispatch(AttemptId(1), &hop.location, parcel(1, Body::Credit))
+        .post(AttemptId(1), &hop.location, parcel(1, Body::Credit))
         .expect("the hop can be reached");
     assert_eq!(concluded(&[&a, &b], &b, 1), accepted());
     assert_eq!(a.arrived(0).body, Body::Credit);

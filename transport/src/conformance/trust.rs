@@ -84,7 +84,7 @@ impl Party {
         let transport = &self.endpoint.transport;
         let before = *other.record.arrived.lock();
         let sent = parcel(attempt, letter(attempt));
-        if transport.dispatch(id, &other.location, sent).is_err() {
+        if transport.post(id, &other.location, sent).is_err() {
             return false;
         }
         let started = Instant::now();

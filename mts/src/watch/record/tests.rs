@@ -2,7 +2,7 @@ use fipa_acl::{AgentId, Performative};
 use fipa_transport::{Attempt, FailureReason, TransportError, TransportErrorKind};
 
 use super::*;
-use crate::core::SendId;
+use crate::core::SubmissionId;
 use crate::letter_for;
 
 fn agent(name: &str) -> AgentId {
@@ -42,7 +42,7 @@ fn all() -> Vec<News> {
     };
     vec![
         News::Sent {
-            send: Some(SendId(9)),
+            send: Some(SubmissionId(9)),
             letter: letter.clone(),
         },
         News::Taken {

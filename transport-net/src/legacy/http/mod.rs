@@ -223,7 +223,7 @@ impl Transport for HttpTransport {
             })
     }
 
-    fn dispatch(
+    fn post(
         &self,
         attempt: AttemptId,
         to: &Location,

@@ -151,7 +151,7 @@ impl Core {
     ///
     /// # Errors
     /// When there is no room for the letter, or for the connection that it needs.
-    pub(crate) fn dispatch(
+    pub(crate) fn post(
         &mut self,
         attempt: AttemptId,
         to: &Location,

@@ -138,7 +138,7 @@ impl Translator {
         let mut next = self.endpoint.call(begin).flatten();
         while let Some(translation) = next.take() {
             let translated = translation.run(self.max);
-            let handled = self.endpoint.dispatch(&translation.to, |core, now| {
+            let handled = self.endpoint.post(&translation.to, |core, now| {
                 let fresh = core.handle_translated(now, translated);
                 next = core.begin_translation();
                 Ok(fresh)
@@ -209,15 +209,15 @@ mod tests {
             })
             .unwrap();
         let to = Location::new(Kind::Udt, "127.0.0.1:9").unwrap();
-        let dispatch = |attempt: u64| {
+        let post = |attempt: u64| {
             let letter = Letter::new(Bytes::from_static(b"x"), Bytes::new());
             let attempt = AttemptId(attempt);
             let starts =
-                endpoint.queue(|core| core.dispatch(attempt, &to, "arm".into(), letter.clone()));
+                endpoint.queue(|core| core.post(attempt, &to, "arm".into(), letter.clone()));
             starts.unwrap()
         };
-        assert!(dispatch(1));
-        assert!(!dispatch(2));
+        assert!(post(1));
+        assert!(!post(2));
         // As far as a translation that panics.
         let begun = endpoint.call(|core, _| core.begin_translation());
         assert!(begun.flatten().is_some());
@@ -229,7 +229,7 @@ mod tests {
                 "{conclusion:?}"
             );
         }
-        assert!(dispatch(3), "another task is needed");
+        assert!(post(3), "another task is needed");
         endpoint.close();
         until("the last conclusion", || sink.0.lock().len() == 3);
     }

@@ -177,7 +177,7 @@ impl UdtPackets {
         let pieces = [Bytes::from(vec![1; len / 2 + 1]), Bytes::from(vec![2; len])];
         let [envelope, message] = pieces.clone();
         let letter = Letter::new(envelope, message);
-        let dispatched = self.core.dispatch(attempt, &to, "arm".into(), letter);
+        let dispatched = self.core.post(attempt, &to, "arm".into(), letter);
         if dispatched.is_err() {
             return;
         }

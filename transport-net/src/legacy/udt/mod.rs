@@ -117,7 +117,7 @@ impl Transport for UdtTransport {
         })
     }
 
-    fn dispatch(
+    fn post(
         &self,
         attempt: AttemptId,
         to: &Location,
@@ -140,7 +140,7 @@ impl Transport for UdtTransport {
         }
         let starts = self
             .endpoint
-            .queue(|core| core.dispatch(attempt, to, parcel.receiver, letter))?;
+            .queue(|core| core.post(attempt, to, parcel.receiver, letter))?;
         if starts {
             let translator = Translator::new(Arc::clone(&self.endpoint), max);
             self.runtime.spawn(translator.run());

@@ -134,7 +134,7 @@ impl Simulation {
         let [envelope, message] = letter(number, len);
         let letter = Letter::new(envelope, message);
         self.cores[from]
-            .dispatch(AttemptId(number), &to(1 - from), "arm".into(), letter)
+            .post(AttemptId(number), &to(1 - from), "arm".into(), letter)
             .map_err(|error| error.fault)?;
         self.flush();
         Ok(())
@@ -814,7 +814,7 @@ fn peers_without_access_are_neither_answered_nor_dialed() {
     let core = &mut simulation.cores[B];
     let [envelope, message] = letter(1, 9);
     let letter = Letter::new(envelope, message);
-    let starts = core.dispatch(AttemptId(1), &location, "arm".into(), letter);
+    let starts = core.post(AttemptId(1), &location, "arm".into(), letter);
     assert!(starts.unwrap());
     let translation = core.begin_translation().unwrap();
     let fresh = core.handle_translated(now, Ok(pieces(&translation)));
@@ -987,15 +987,15 @@ fn letters_before_their_translation_count_for_the_limits() {
     assert_eq!(simulation.send(A, 9, 10), congested, "too many letters");
     // Each location needs a connection.
     let location = |n: u8| Location::new(Kind::Udt, &format!("192.0.2.{n}:7790")).unwrap();
-    let mut dispatch = |attempt: u64, n: u8| {
+    let mut post = |attempt: u64, n: u8| {
         let letter = Letter::new(Bytes::from_static(b"x"), Bytes::new());
         let core = &mut simulation.cores[A];
-        let queued = core.dispatch(AttemptId(attempt), &location(n), "arm".into(), letter);
+        let queued = core.post(AttemptId(attempt), &location(n), "arm".into(), letter);
         queued.map_err(|error| error.fault)
     };
-    assert_eq!(dispatch(10, 77), Ok(false));
-    assert_eq!(dispatch(11, 78), congested.map(|()| false));
-    assert_eq!(dispatch(12, 77), Ok(false));
+    assert_eq!(post(10, 77), Ok(false));
+    assert_eq!(post(11, 78), congested.map(|()| false));
+    assert_eq!(post(12, 77), Ok(false));
 }
 
 #[test]

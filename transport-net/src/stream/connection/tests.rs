@@ -68,7 +68,7 @@ impl Side {
         }
     }
 
-    fn dispatch(&mut self, len: usize) -> Result<(), SendError> {
+    fn post(&mut self, len: usize) -> Result<(), SendError> {
         let sequence = self.dispatched.len() as u64;
         self.connection
             .send(AttemptId(sequence), &parcel(sequence, len))?;
@@ -182,7 +182,7 @@ fn step() -> impl Strategy<Value = (bool, Step)> {
 
 fn perform(step: &Step, this: &mut Side, other: &mut Side, now: Instant) {
     match step {
-        Step::Dispatch(len) => match this.dispatch(*len) {
+        Step::Dispatch(len) => match this.post(*len) {
             Err(SendError::Transport(error)) => {
                 assert_eq!(error.fault, TransportErrorKind::Congested)
             }
@@ -302,7 +302,7 @@ fn another_incarnation_ends_the_connection_before_a_parcel_is_sent() {
     let expected = Incarnation::from_u64(3);
     let mut a = Side::new(Role::Dialler { expected }, 1, now);
     let mut b = Side::new(Role::Acceptor, 2, now);
-    a.dispatch(10).unwrap();
+    a.post(10).unwrap();
     settle(&mut a, &mut b, now);
     let found = Incarnation::from_u64(2);
     assert_eq!(
@@ -324,7 +324,7 @@ fn a_connection_that_leads_back_names_the_cause_on_both_ends() {
     for expected in [Incarnation::UNKNOWN, Incarnation::from_u64(3)] {
         let mut a = Side::new(Role::Dialler { expected }, 1, now);
         let mut b = Side::new(Role::Acceptor, 1, now);
-        a.dispatch(10).unwrap();
+        a.post(10).unwrap();
         settle(&mut a, &mut b, now);
         assert_eq!(a.end, Some(ConnectionEnd::Itself));
         assert_eq!(b.end, Some(ConnectionEnd::Itself));
@@ -344,15 +344,15 @@ fn a_letter_that_the_peer_does_not_accept_is_not_sent() {
     let now = Instant::now();
     let (mut a, mut b) = pair(now);
     b.connection.hello.max_letter = 100;
-    a.dispatch(101).unwrap();
-    a.dispatch(10).unwrap();
+    a.post(101).unwrap();
+    a.post(10).unwrap();
     settle(&mut a, &mut b, now);
     match &a.concluded[&AttemptId(0)][..] {
         [Conclusion::NotSent(error)] => assert_eq!(error.fault, TransportErrorKind::TooLarge),
         other => panic!("{other:?}"),
     }
     assert_eq!(b.arrived, [1]);
-    assert!(matches!(a.dispatch(101), Err(SendError::Transport(error))
+    assert!(matches!(a.post(101), Err(SendError::Transport(error))
         if error.fault == TransportErrorKind::TooLarge));
 }
 
@@ -364,9 +364,9 @@ fn the_window_of_the_peer_is_respected_and_congestion_reported() {
     settle(&mut a, &mut b, now);
     // A quarter is for parcels other than letters.
     for _ in 0..limits().max_in_flight * 3 / 4 {
-        a.dispatch(10).unwrap();
+        a.post(10).unwrap();
     }
-    assert!(matches!(a.dispatch(10), Err(SendError::Transport(error))
+    assert!(matches!(a.post(10), Err(SendError::Transport(error))
         if error.fault == TransportErrorKind::Congested));
     a.transmit(usize::MAX, &mut b.coming, now);
     a.transmit(usize::MAX, &mut b.coming, now);
@@ -380,11 +380,11 @@ fn queued_bytes_are_bounded_and_one_letter_always_fits() {
     let now = Instant::now();
     let (mut a, _) = pair(now);
     a.connection.limits.max_queued_bytes = 100;
-    a.dispatch(4000).unwrap();
-    assert!(matches!(a.dispatch(1), Err(SendError::Transport(error))
+    a.post(4000).unwrap();
+    assert!(matches!(a.post(1), Err(SendError::Transport(error))
         if error.fault == TransportErrorKind::Congested));
     a.connection.abandon(AttemptId(0), now);
-    a.dispatch(1).unwrap();
+    a.post(1).unwrap();
 }
 
 #[test]
@@ -488,7 +488,7 @@ fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
 fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
     let start = Instant::now();
     let (mut a, _b) = greeted(start);
-    a.dispatch(4000).unwrap();
+    a.post(4000).unwrap();
     let timeout = limits().keep_alive / 4;
     assert!(a.connection.doubt(start, Duration::ZERO));
     let mut now = start;
@@ -510,23 +510,23 @@ fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
     let timeout = limits().keep_alive / 20 + Duration::from_millis(50);
-    let dispatch = |a: &mut Side, now| {
-        a.dispatch(10).unwrap();
+    let post = |a: &mut Side, now| {
+        a.post(10).unwrap();
         a.transmit(usize::MAX, &mut BytesMut::new(), now);
         AttemptId(a.connection.last_sent - 1)
     };
     let now = start + Duration::from_millis(1);
-    let first = dispatch(&mut a, now);
+    let first = post(&mut a, now);
     // A letter with a short deadline does not make the connection suspect.
     a.connection.abandon(first, now + timeout / 2);
     assert!(!a.connection.is_suspect());
-    let second = dispatch(&mut a, now);
+    let second = post(&mut a, now);
     a.connection
         .received(Reader::Main, 1, false, now + timeout / 2);
     a.connection.abandon(second, now + timeout * 2);
     assert!(!a.connection.is_suspect(), "a byte arrived meanwhile");
     let now = now + timeout * 3;
-    let third = dispatch(&mut a, now);
+    let third = post(&mut a, now);
     a.connection.abandon(third, now + timeout);
     assert!(a.connection.is_suspect());
     // The peer gets a ping, and its response counts.
@@ -543,7 +543,7 @@ fn an_idle_connection_closes_unless_a_parcel_is_open() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
     let mut now = start;
-    a.dispatch(1).unwrap();
+    a.post(1).unwrap();
     a.transmit(usize::MAX, &mut b.coming, now);
     b.receive(usize::MAX, now);
     for _ in 0..20 {
@@ -562,7 +562,7 @@ fn an_idle_connection_closes_unless_a_parcel_is_open() {
         a.connection.handle_timeout(now, [0; 2]),
         Err(ConnectionEnd::Idle)
     );
-    assert_eq!(a.dispatch(1), Err(SendError::Ended));
+    assert_eq!(a.post(1), Err(SendError::Ended));
 }
 
 #[test]

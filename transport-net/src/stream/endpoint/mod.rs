@@ -572,7 +572,7 @@ impl Endpoint {
 
     /// Sends a parcel over a connection to a location. `dial` starts the task of a new connection
     /// when there is none.
-    pub(crate) fn dispatch(
+    pub(crate) fn post(
         &self,
         attempt: AttemptId,
         to: &Location,

@@ -404,7 +404,7 @@ impl<'a> Dispatcher<'a> {
     }
 
     /// Returns the place of the link among the dialed ones.
-    fn dispatch(&mut self, parcel: &Parcel) -> usize {
+    fn post(&mut self, parcel: &Parcel) -> usize {
         self.attempts += 1;
         let attempt = AttemptId(self.attempts);
         let dial = |link: Arc<Link>, _| {
@@ -412,9 +412,7 @@ impl<'a> Dispatcher<'a> {
             self.links.lock().push(link);
             tokio::spawn(std::future::pending())
         };
-        self.endpoint
-            .dispatch(attempt, &self.to, parcel, dial)
-            .unwrap();
+        self.endpoint.post(attempt, &self.to, parcel, dial).unwrap();
         let links = self.links.lock();
         let place = links.iter().position(|link| link.has_attempt(attempt));
         place.unwrap()
@@ -430,15 +428,15 @@ async fn large_letters_take_a_connection_of_their_own() {
     let endpoint = endpoint(Limits::default());
     let mut to_arm = Dispatcher::new(&endpoint);
     let (small, large) = (letter_of(64 << 10, 1), letter_of(70_000, 1));
-    assert_eq!(to_arm.dispatch(&small), 0);
-    assert_eq!(to_arm.dispatch(&large), 1);
-    assert_eq!(to_arm.dispatch(&small), 1, "it follows the large one");
-    assert_eq!(to_arm.dispatch(&letter_of(10, 9)), 0, "another stream");
+    assert_eq!(to_arm.post(&small), 0);
+    assert_eq!(to_arm.post(&large), 1);
+    assert_eq!(to_arm.post(&small), 1, "it follows the large one");
+    assert_eq!(to_arm.post(&letter_of(10, 9)), 0, "another stream");
     let report = Parcel {
         body: Body::Credit,
         ..small.clone()
     };
-    assert_eq!(to_arm.dispatch(&report), 0);
+    assert_eq!(to_arm.post(&report), 0);
     assert_eq!(to_arm.link(1).load(), Load::Large);
     // The large one does not begin before the small one is answered.
     assert_eq!(to_arm.link(1).may_begin(), 0);
@@ -448,16 +446,16 @@ async fn large_letters_take_a_connection_of_their_own() {
         to_arm.link(1).begins();
         to_arm.link(1).answered(id);
     }
-    assert_eq!(to_arm.dispatch(&small), 0, "the large one has arrived");
+    assert_eq!(to_arm.post(&small), 0, "the large one has arrived");
 }
 
 #[tokio::test]
 async fn a_large_letter_does_not_wait_for_an_attempt_that_has_ended() {
     let endpoint = endpoint(Limits::default());
     let mut to_arm = Dispatcher::new(&endpoint);
-    assert_eq!(to_arm.dispatch(&letter_of(10, 1)), 0);
+    assert_eq!(to_arm.post(&letter_of(10, 1)), 0);
     to_arm.link(0).begins();
-    assert_eq!(to_arm.dispatch(&letter_of(70_000, 1)), 1);
+    assert_eq!(to_arm.post(&letter_of(70_000, 1)), 1);
     assert_eq!(to_arm.link(1).may_begin(), 0);
     let ended = endpoint.abandon(AttemptId(1), &to_arm.to);
     assert_eq!(ended, Abandoned::Unconfirmed);
@@ -469,13 +467,13 @@ async fn without_a_connection_of_their_own_large_letters_take_the_other_one() {
     let endpoint = endpoint(Limits::default());
     let mut to_arm = Dispatcher::new(&endpoint);
     let (small, large) = (letter_of(10, 1), letter_of(70_000, 2));
-    assert_eq!(to_arm.dispatch(&large), 0);
+    assert_eq!(to_arm.post(&large), 0);
     let alone = to_arm.link(0);
     assert!(!endpoint.has_detour(&alone), "there is no other one");
-    assert_eq!(to_arm.dispatch(&small), 1);
+    assert_eq!(to_arm.post(&small), 1);
     assert!(endpoint.has_detour(&alone));
     endpoint.forget(&alone);
-    assert_eq!(to_arm.dispatch(&large), 1);
+    assert_eq!(to_arm.post(&large), 1);
 }
 
 #[tokio::test]
@@ -625,7 +623,7 @@ async fn the_reason_of_a_peer_counts_when_writing_fails_first() {
     let letter = letter_of(100, 1);
     let sink = errors.clone();
     let stream = Mutex::new(Some(stream));
-    let serving = endpoint.dispatch(AttemptId(1), &to, &letter, |link, _| {
+    let serving = endpoint.post(AttemptId(1), &to, &letter, |link, _| {
         let running = LinkTask::new(
             endpoint.clone(),
             link.clone(),

@@ -167,7 +167,7 @@ impl Core {
 
     /// Queues a parcel for sending. Returns the number of the connection if it is new; the caller
     /// then calls [`begin`](Self::begin) or [`cannot_begin`](Self::cannot_begin).
-    pub(crate) fn dispatch(
+    pub(crate) fn post(
         &mut self,
         now: Instant,
         attempt: AttemptId,

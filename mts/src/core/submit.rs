@@ -8,7 +8,7 @@ use fipa_sds::{Entry, Resolution, Role};
 use fipa_transport::{Attempt, FailureReason, Incarnation, Outcome, Stream};
 
 use super::action::Action;
-use super::ids::{SendId, registration_of};
+use super::ids::{SubmissionId, registration_of};
 use super::lane::Delivery;
 use super::lanes::own_lane;
 use super::origin::Origin;
@@ -34,7 +34,7 @@ impl Core {
     /// known at once are among the actions when this method returns. The number is `None` if a
     /// receiver is not in the view, or is a pattern: [`Action::Resolved`] then reports it after the
     /// directory was refreshed. Letters of one sender are resolved in the order of the calls.
-    pub fn send(&mut self, now: Now, submission: Submission) -> (SendId, Option<usize>) {
+    pub fn submit(&mut self, now: Now, submission: Submission) -> (SubmissionId, Option<usize>) {
         let Submission {
             sender,
             letter,
@@ -42,13 +42,13 @@ impl Core {
             deadline,
         } = submission;
         let letter = match &receivers[..] {
-            [receiver] => match self.send_to_name(now, sender, letter, receiver, deadline) {
+            [receiver] => match self.submit_to_name(now, sender, letter, receiver, deadline) {
                 Ok(send) => return (send, Some(1)),
                 Err(letter) => letter,
             },
             _ => letter,
         };
-        let send = SendId(self.next_send);
+        let send = SubmissionId(self.next_send);
         self.next_send += 1;
         if self.closed {
             for receiver in &receivers {
@@ -88,20 +88,20 @@ impl Core {
     /// Sends a letter to the agent with exactly this name. One outcome follows.
     ///
     /// # Errors
-    /// Returns the letter if it must be submitted to [`send`](Self::send), for example because the view
+    /// Returns the letter if it must be submitted to [`submit`](Self::submit), for example because the view
     /// shows no such agent.
     #[expect(
         clippy::result_large_err,
         reason = "the letter is moved in and back; a box would cost an allocation"
     )]
-    pub fn send_to_name(
+    pub fn submit_to_name(
         &mut self,
         now: Now,
         sender: Incarnation,
         letter: Letter,
         receiver: &str,
         deadline: Duration,
-    ) -> Result<SendId, Letter> {
+    ) -> Result<SubmissionId, Letter> {
         if self.closed || !self.is_in_turn(sender) {
             return Err(letter);
         }
@@ -111,10 +111,10 @@ impl Core {
         let Some(entry) = self.table.view.named(receiver).filter(is_agent) else {
             return Err(letter);
         };
-        let send = SendId(self.next_send);
+        let send = SubmissionId(self.next_send);
         self.next_send += 1;
         let deadline = now.instant + deadline.min(MAX_DEADLINE);
-        self.send_one(now, (send, sender), &entry, letter, deadline);
+        self.submit_one(now, (send, sender), &entry, letter, deadline);
         self.send_failures(now);
         Ok(send)
     }
@@ -192,7 +192,7 @@ impl Core {
                 }
                 reached.push(registration);
                 count += 1;
-                self.send_one(now, (send, sender), &entry, letter.clone(), deadline);
+                self.submit_one(now, (send, sender), &entry, letter.clone(), deadline);
             }
         }
         self.send_failures(now);
@@ -242,20 +242,20 @@ impl Core {
 
     /// Sends a letter to exactly this registration of an agent; the receivers in the submission are
     /// ignored. One outcome follows under this ID.
-    pub fn send_to(&mut self, now: Now, submission: Submission, entry: &Entry) -> SendId {
-        let send = SendId(self.next_send);
+    pub fn submit_to(&mut self, now: Now, submission: Submission, entry: &Entry) -> SubmissionId {
+        let send = SubmissionId(self.next_send);
         self.next_send += 1;
         let deadline = now.instant + submission.deadline.min(MAX_DEADLINE);
         let sending = (send, submission.sender);
-        self.send_one(now, sending, entry, submission.letter, deadline);
+        self.submit_one(now, sending, entry, submission.letter, deadline);
         self.send_failures(now);
         send
     }
 
-    pub(super) fn send_one(
+    pub(super) fn submit_one(
         &mut self,
         now: Now,
-        (send, sender): (SendId, Incarnation),
+        (send, sender): (SubmissionId, Incarnation),
         entry: &Entry,
         letter: Letter,
         deadline: Instant,
@@ -290,8 +290,8 @@ impl Core {
         (sender, letter): (Incarnation, Letter),
         receiver: Arc<str>,
         attempts: Vec<Attempt>,
-    ) -> SendId {
-        let send = SendId(self.next_send);
+    ) -> SubmissionId {
+        let send = SubmissionId(self.next_send);
         self.next_send += 1;
         let reason = FailureReason::NoSuchAgent;
         self.failed(send, sender, receiver, letter, (reason, attempts));
@@ -302,7 +302,7 @@ impl Core {
     /// Fails a letter to an agent that the directory does not list.
     pub(super) fn absent(
         &mut self,
-        send: SendId,
+        send: SubmissionId,
         sender: Incarnation,
         receiver: Arc<str>,
         letter: Letter,
@@ -314,7 +314,7 @@ impl Core {
 
     pub(super) fn failed(
         &mut self,
-        send: SendId,
+        send: SubmissionId,
         sender: Incarnation,
         receiver: Arc<str>,
         letter: Letter,
@@ -351,7 +351,7 @@ impl Core {
 
     pub(super) fn undeliverable(
         &mut self,
-        send: SendId,
+        send: SubmissionId,
         sender: Incarnation,
         receiver: Arc<str>,
         letter: Letter,
