@@ -15,7 +15,7 @@ use fipa::{
 use fipa_mts::letter_for;
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Location, Parcel,
-    Sink, Stream, Transport as _, Verdict,
+    Reaction, Sink, Stream, Transport as _,
 };
 use fipa_transport_net::{Identity, TcpConfig, TcpTransport};
 
@@ -150,8 +150,8 @@ async fn a_sender_beyond_its_rate_is_refused_and_others_are_not() {
 struct StoredConclusion(parking_lot::Mutex<Option<Conclusion>>);
 
 impl Sink for StoredConclusion {
-    fn arrived(&self, _: Arrival) -> Verdict {
-        Verdict::Now(Answer::Accepted)
+    fn arrived(&self, _: Arrival) -> Reaction {
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _: fipa::Letter, _: Kind, _: LegacySource) {}
@@ -196,9 +196,7 @@ async fn hand_over(peer: TcpConfig, sender: &str, to: &Entry, at: &[Location]) -
         body: Body::Letter(letter_for(&message, SystemTime::now()).unwrap()),
     };
     let at = at.iter().find(|it| it.kind() == Kind::Tcp);
-    transport
-        .post(AttemptId(1), at.unwrap(), parcel)
-        .unwrap();
+    transport.post(AttemptId(1), at.unwrap(), parcel).unwrap();
     let began = Instant::now();
     loop {
         if let Some(conclusion) = stored.0.lock().take() {

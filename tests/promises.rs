@@ -23,8 +23,8 @@ use fipa_mts::core::Submission;
 use fipa_mts::{AccessGate, LetterParts, Sending, letter_for};
 use fipa_testbed::until_async;
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
-    Transport, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Reaction,
+    Sink, Stream, Transport,
 };
 use fipa_transport_net::{Identity, Limits, QuicConfig, QuicTransport, TcpConfig, TcpTransport};
 use parking_lot::Mutex;
@@ -467,8 +467,8 @@ async fn a_letter_is_not_sent_unencrypted_and_its_outcome_has_the_failed_attempt
 struct Conclusions(Mutex<HashMap<AttemptId, Conclusion>>);
 
 impl Sink for Conclusions {
-    fn arrived(&self, _: Arrival) -> Verdict {
-        Verdict::Now(Answer::Accepted)
+    fn arrived(&self, _: Arrival) -> Reaction {
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}
@@ -533,9 +533,7 @@ impl RepeatingPeer {
             body: Body::Letter(letter(sequence as usize)),
         };
         let attempt = AttemptId(attempt);
-        self.transport
-            .post(attempt, &to.at(kind), parcel)
-            .unwrap();
+        self.transport.post(attempt, &to.at(kind), parcel).unwrap();
         until_async("an answer", || {
             self.conclusions.0.lock().contains_key(&attempt)
         })

@@ -1,6 +1,6 @@
 //! Contents of messages (FIPA00008 clause 3.1).
 
-use crate::Dialect;
+use crate::SlDialect;
 use crate::error::ParseError;
 use crate::parse::Parser;
 use crate::term::{ActionExpression, IdentifyingExpression};
@@ -43,7 +43,7 @@ impl<'a> Content<'a> {
     /// When the bytes are not one content, are nested deeper than [`MAX_DEPTH`](crate::MAX_DEPTH),
     /// or have more than [`MAX_NODES`](crate::MAX_NODES) terms and formulas.
     pub fn parse(bytes: &'a (impl AsRef<[u8]> + ?Sized)) -> Result<Self, ParseError> {
-        Self::parse_in(Dialect::Standard, bytes)
+        Self::parse_in(SlDialect::Standard, bytes)
     }
 
     /// Parses a content that comes from a writer of this dialect.
@@ -51,7 +51,7 @@ impl<'a> Content<'a> {
     /// # Errors
     /// See [`parse`](Self::parse).
     pub fn parse_in(
-        dialect: Dialect,
+        dialect: SlDialect,
         bytes: &'a (impl AsRef<[u8]> + ?Sized),
     ) -> Result<Self, ParseError> {
         Parser::whole(dialect, bytes.as_ref(), Parser::content)

@@ -8,7 +8,7 @@ use std::fmt;
 /// a byte-length encoded string (`#4"…`) is text or raw bytes in the standard, and Base64 in JADE.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 #[non_exhaustive]
-pub enum Dialect {
+pub enum SlDialect {
     /// FIPA00008.
     #[default]
     Standard,
@@ -21,7 +21,7 @@ pub enum Dialect {
     Jade,
 }
 
-impl fmt::Display for Dialect {
+impl fmt::Display for SlDialect {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
             Self::Standard => "standard",

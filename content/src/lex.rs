@@ -7,7 +7,7 @@ use base64::alphabet;
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use fipa_acl::Time;
 
-use crate::Dialect;
+use crate::SlDialect;
 use crate::chars::{begins_number, begins_word, is_delimiter, is_white};
 use crate::error::{ParseError, Problem};
 use crate::number::{self, Number};
@@ -72,11 +72,11 @@ pub(crate) struct Lexer<'a> {
     /// The bytes as text, if they are valid UTF-8. Tokens then need no separate check.
     text: Option<&'a str>,
     at: usize,
-    dialect: Dialect,
+    dialect: SlDialect,
 }
 
 impl<'a> Lexer<'a> {
-    pub(crate) fn new(bytes: &'a [u8], dialect: Dialect) -> Self {
+    pub(crate) fn new(bytes: &'a [u8], dialect: SlDialect) -> Self {
         Self {
             bytes,
             text: std::str::from_utf8(bytes).ok(),
@@ -85,7 +85,7 @@ impl<'a> Lexer<'a> {
         }
     }
 
-    pub(crate) fn dialect(&self) -> Dialect {
+    pub(crate) fn dialect(&self) -> SlDialect {
         self.dialect
     }
 
@@ -263,7 +263,7 @@ impl<'a> Lexer<'a> {
         loop {
             let behind = rest.get(end..).unwrap_or_default();
             let Some(found) = memchr::memchr(b'"', behind) else {
-                if escaped && self.dialect == Dialect::Jade {
+                if escaped && self.dialect == SlDialect::Jade {
                     break;
                 }
                 return Err(ParseError::new(
@@ -313,7 +313,7 @@ impl<'a> Lexer<'a> {
         };
         let first = self.at + digits.len() + 1;
         self.at = first + taken.len();
-        if self.dialect == Dialect::Jade {
+        if self.dialect == SlDialect::Jade {
             return match BASE64.decode(taken) {
                 Ok(bytes) => Ok(Token::Bytes(Cow::Owned(bytes))),
                 Err(_) => Err(ParseError::new(first, "JADE String", Problem::Base64)),
@@ -366,7 +366,7 @@ mod tests {
     use super::*;
 
     fn tokens(bytes: &[u8]) -> Result<Vec<Token<'_>>, ParseError> {
-        let mut lexer = Lexer::new(bytes, Dialect::Standard);
+        let mut lexer = Lexer::new(bytes, SlDialect::Standard);
         let mut tokens = Vec::new();
         loop {
             match lexer.next()? {
@@ -380,12 +380,12 @@ mod tests {
     fn the_last_string_of_jade_may_end_in_a_backslash() {
         let first = |dialect, bytes| Lexer::new(bytes, dialect).next();
         let text = br#""C:\logs\"))"#;
-        let read = first(Dialect::Jade, text);
+        let read = first(SlDialect::Jade, text);
         assert_eq!(read, Ok(Token::Literal(r"C:\logs\".into())));
         let text = br#""say \"hi\" \"))"#;
-        let read = first(Dialect::Jade, text);
+        let read = first(SlDialect::Jade, text);
         assert_eq!(read, Ok(Token::Literal(r#"say "hi" \"#.into())));
-        let refused = first(Dialect::Standard, text).unwrap_err();
+        let refused = first(SlDialect::Standard, text).unwrap_err();
         assert_eq!(refused.problem(), &Problem::Truncated("string"));
     }
 
@@ -426,7 +426,7 @@ mod tests {
     #[test]
     fn a_count_that_ends_within_a_character_gives_bytes() {
         let text = "#1\"é".as_bytes();
-        let mut lexer = Lexer::new(text, Dialect::Standard);
+        let mut lexer = Lexer::new(text, SlDialect::Standard);
         assert_eq!(lexer.next(), Ok(Token::Bytes(text[3..4].into())));
         let error = lexer.next().unwrap_err();
         assert_eq!(error.problem(), &Problem::NotUtf8("word"));
@@ -434,7 +434,7 @@ mod tests {
 
     #[test]
     fn byte_strings_of_jade_are_base64() {
-        let mut lexer = Lexer::new(b"#4\"aGk= #4\"a!!!", Dialect::Jade);
+        let mut lexer = Lexer::new(b"#4\"aGk= #4\"a!!!", SlDialect::Jade);
         assert_eq!(lexer.next(), Ok(Token::Bytes(b"hi"[..].into())));
         let error = lexer.next().unwrap_err();
         assert_eq!((error.offset(), error.problem()), (11, &Problem::Base64));

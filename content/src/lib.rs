@@ -6,7 +6,7 @@
 //!
 //! * [`Content`], [`Wff`] and [`Term`] are parsed text. They borrow from the message, or own their
 //!   text after `into_owned()`. [`Printer`] writes them, on one line or indented, for readers of the
-//!   standard or of JADE ([`Dialect`]).
+//!   standard or of JADE ([`SlDialect`]).
 //! * [`to_vec`] and [`from_slice`] convert Rust values to the text of a term and back, without an
 //!   intermediate tree.
 //! * [`ActionExpression::new`], [`Wff::done`], [`Wff::result`], [`Content::of_refusal`] and
@@ -118,7 +118,7 @@ pub use self::serde::{
 pub use act::ReadError;
 pub use agent::AgentTermError;
 pub use content::{Content, ContentExpression};
-pub use dialect::Dialect;
+pub use dialect::SlDialect;
 pub use error::{ParseError, PrintError, Problem};
 pub use number::Number;
 pub use print::{Expression, Printer};

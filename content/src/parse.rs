@@ -11,7 +11,7 @@ use crate::term::{
     ReferentialOperator, Term,
 };
 use crate::wff::{LogicalOperator, ModalOperator, Quantifier, Wff};
-use crate::{Dialect, MAX_DEPTH, MAX_NODES};
+use crate::{MAX_DEPTH, MAX_NODES, SlDialect};
 
 const CONTENT: &str = "FIPA00008 Content";
 const EXPRESSION: &str = "FIPA00008 ContentExpression";
@@ -57,7 +57,7 @@ impl<'a> Head<'a> {
 impl<'a> Parser<'a> {
     /// Parses with `read` and checks that no bytes are left.
     pub(crate) fn whole<T>(
-        dialect: Dialect,
+        dialect: SlDialect,
         bytes: &'a [u8],
         read: impl FnOnce(&mut Self) -> Result<T, ParseError>,
     ) -> Result<T, ParseError> {
@@ -67,7 +67,7 @@ impl<'a> Parser<'a> {
     /// Parses with `read` at this depth of parentheses and checks that no bytes are left.
     pub(crate) fn whole_at<T>(
         depth: usize,
-        dialect: Dialect,
+        dialect: SlDialect,
         bytes: &'a [u8],
         read: impl FnOnce(&mut Self) -> Result<T, ParseError>,
     ) -> Result<T, ParseError> {

@@ -8,7 +8,7 @@ use crate::error::ParseError;
 use crate::number::Number;
 use crate::parse::Parser;
 use crate::wff::Wff;
-use crate::{Dialect, into_owned};
+use crate::{SlDialect, into_owned};
 
 /// A term (FIPA00008 `TermOrIE`).
 ///
@@ -135,7 +135,7 @@ impl<'a> Term<'a> {
     /// When the bytes are not one term, are nested deeper than [`MAX_DEPTH`](crate::MAX_DEPTH), or
     /// have more than [`MAX_NODES`](crate::MAX_NODES) terms and formulas.
     pub fn parse(bytes: &'a (impl AsRef<[u8]> + ?Sized)) -> Result<Self, ParseError> {
-        Self::parse_in(Dialect::Standard, bytes)
+        Self::parse_in(SlDialect::Standard, bytes)
     }
 
     /// Parses one term that comes from a writer of this dialect.
@@ -143,7 +143,7 @@ impl<'a> Term<'a> {
     /// # Errors
     /// See [`parse`](Self::parse).
     pub fn parse_in(
-        dialect: Dialect,
+        dialect: SlDialect,
         bytes: &'a (impl AsRef<[u8]> + ?Sized),
     ) -> Result<Self, ParseError> {
         Parser::whole(dialect, bytes.as_ref(), Parser::term)

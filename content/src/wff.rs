@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use crate::error::ParseError;
 use crate::parse::Parser;
 use crate::term::{ActionExpression, Term, owned_terms};
-use crate::{Dialect, into_owned};
+use crate::{SlDialect, into_owned};
 
 /// A well-formed formula (FIPA00008 `Wff`).
 #[derive(Debug, Clone, PartialEq)]
@@ -136,7 +136,7 @@ impl<'a> Wff<'a> {
     /// When the bytes are not one formula, are nested deeper than [`MAX_DEPTH`](crate::MAX_DEPTH),
     /// or have more than [`MAX_NODES`](crate::MAX_NODES) terms and formulas.
     pub fn parse(bytes: &'a (impl AsRef<[u8]> + ?Sized)) -> Result<Self, ParseError> {
-        Self::parse_in(Dialect::Standard, bytes)
+        Self::parse_in(SlDialect::Standard, bytes)
     }
 
     /// Parses one formula that comes from a writer of this dialect.
@@ -144,7 +144,7 @@ impl<'a> Wff<'a> {
     /// # Errors
     /// See [`parse`](Self::parse).
     pub fn parse_in(
-        dialect: Dialect,
+        dialect: SlDialect,
         bytes: &'a (impl AsRef<[u8]> + ?Sized),
     ) -> Result<Self, ParseError> {
         Parser::whole(dialect, bytes.as_ref(), Parser::wff)

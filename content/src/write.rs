@@ -6,13 +6,13 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use fipa_acl::{Time, Zone};
 
-use crate::Dialect;
+use crate::SlDialect;
 use crate::chars::{Shape, is_jade_operator, is_term_keyword, is_wff_keyword, truth};
 use crate::error::PrintError;
 
 /// Appends a string constant.
 #[inline]
-pub(crate) fn string(out: &mut Vec<u8>, dialect: Dialect, text: &str) -> Result<(), PrintError> {
+pub(crate) fn string(out: &mut Vec<u8>, dialect: SlDialect, text: &str) -> Result<(), PrintError> {
     let shape = Shape::of(text);
     if is_word(shape, dialect) && truth(text).is_none() {
         out.extend_from_slice(text.as_bytes());
@@ -23,7 +23,7 @@ pub(crate) fn string(out: &mut Vec<u8>, dialect: Dialect, text: &str) -> Result<
 
 /// Appends the name of a parameter or variable.
 #[inline]
-pub(crate) fn name(out: &mut Vec<u8>, dialect: Dialect, text: &str) -> Result<(), PrintError> {
+pub(crate) fn name(out: &mut Vec<u8>, dialect: SlDialect, text: &str) -> Result<(), PrintError> {
     let shape = Shape::of(text);
     if is_word(shape, dialect) {
         out.extend_from_slice(text.as_bytes());
@@ -35,7 +35,7 @@ pub(crate) fn name(out: &mut Vec<u8>, dialect: Dialect, text: &str) -> Result<()
 /// Appends a proposition symbol.
 pub(crate) fn proposition(
     out: &mut Vec<u8>,
-    dialect: Dialect,
+    dialect: SlDialect,
     text: &str,
 ) -> Result<(), PrintError> {
     let shape = Shape::of(text);
@@ -50,11 +50,11 @@ pub(crate) fn proposition(
 #[inline]
 pub(crate) fn function_symbol(
     out: &mut Vec<u8>,
-    dialect: Dialect,
+    dialect: SlDialect,
     text: &str,
     arithmetic: bool,
 ) -> Result<(), PrintError> {
-    if dialect == Dialect::Jade {
+    if dialect == SlDialect::Jade {
         if text.eq_ignore_ascii_case("sequence") || text.eq_ignore_ascii_case("set") {
             return Err(PrintError::Unrepresentable {
                 what: "function symbol 'sequence' or 'set'",
@@ -72,7 +72,7 @@ pub(crate) fn function_symbol(
 /// Appends a predicate symbol.
 pub(crate) fn predicate_symbol(
     out: &mut Vec<u8>,
-    dialect: Dialect,
+    dialect: SlDialect,
     text: &str,
 ) -> Result<(), PrintError> {
     symbol(out, dialect, text, is_wff_keyword(text))
@@ -80,12 +80,12 @@ pub(crate) fn predicate_symbol(
 
 fn symbol(
     out: &mut Vec<u8>,
-    dialect: Dialect,
+    dialect: SlDialect,
     text: &str,
     is_keyword: bool,
 ) -> Result<(), PrintError> {
     let shape = Shape::of(text);
-    let is_keyword = is_keyword || dialect == Dialect::Jade && is_jade_operator(text);
+    let is_keyword = is_keyword || dialect == SlDialect::Jade && is_jade_operator(text);
     if is_word(shape, dialect) && !is_keyword {
         out.extend_from_slice(text.as_bytes());
         return Ok(());
@@ -94,16 +94,16 @@ fn symbol(
 }
 
 /// Appends a byte-length encoded string.
-pub(crate) fn bytes(out: &mut Vec<u8>, dialect: Dialect, bytes: &[u8]) -> Result<(), PrintError> {
+pub(crate) fn bytes(out: &mut Vec<u8>, dialect: SlDialect, bytes: &[u8]) -> Result<(), PrintError> {
     match dialect {
-        Dialect::Standard => counted(out, bytes),
-        Dialect::Jade => counted(out, BASE64.encode(bytes).as_bytes()),
+        SlDialect::Standard => counted(out, bytes),
+        SlDialect::Jade => counted(out, BASE64.encode(bytes).as_bytes()),
     }
 }
 
 /// Appends a date-time.
-pub(crate) fn time(out: &mut Vec<u8>, dialect: Dialect, time: Time) -> Result<(), PrintError> {
-    if dialect == Dialect::Jade {
+pub(crate) fn time(out: &mut Vec<u8>, dialect: SlDialect, time: Time) -> Result<(), PrintError> {
+    if dialect == SlDialect::Jade {
         let why = if time.is_relative() {
             Some("JADE has no relative times in SL")
         } else if matches!(time.zone(), Zone::Letter(_)) {
@@ -122,17 +122,22 @@ pub(crate) fn time(out: &mut Vec<u8>, dialect: Dialect, time: Time) -> Result<()
 }
 
 #[inline]
-fn is_word(shape: Shape, dialect: Dialect) -> bool {
-    shape.is_word() && (dialect == Dialect::Standard || shape.is_ascii())
+fn is_word(shape: Shape, dialect: SlDialect) -> bool {
+    shape.is_word() && (dialect == SlDialect::Standard || shape.is_ascii())
 }
 
 /// Appends the text in quotation marks, or as a byte-length encoded string if a reader could find
 /// another end of the text.
-fn quoted(out: &mut Vec<u8>, dialect: Dialect, text: &str, shape: Shape) -> Result<(), PrintError> {
+fn quoted(
+    out: &mut Vec<u8>,
+    dialect: SlDialect,
+    text: &str,
+    shape: Shape,
+) -> Result<(), PrintError> {
     if shape.has_backslashes() {
         match dialect {
-            Dialect::Standard if !is_quotable(text) => return counted(out, text.as_bytes()),
-            Dialect::Jade if text.ends_with('\\') => {
+            SlDialect::Standard if !is_quotable(text) => return counted(out, text.as_bytes()),
+            SlDialect::Jade if text.ends_with('\\') => {
                 return Err(PrintError::Unrepresentable {
                     what: "string that ends with a backslash",
                     why: "JADE takes the backslash and the quotation mark behind it for an escape",

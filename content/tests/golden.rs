@@ -8,7 +8,7 @@ use std::path::Path;
 use bytes::Bytes;
 use fipa_acl::{AgentId, Message, Payload};
 use fipa_content::{
-    Content, Dialect, Printer, Problem, Profile, ReadError, Set, Term, Wff, from_slice,
+    Content, Printer, Problem, Profile, ReadError, Set, SlDialect, Term, Wff, from_slice,
 };
 use serde::{Deserialize, Serialize};
 
@@ -50,8 +50,8 @@ fn a_search_is_read_and_written_as_jade_does() {
     for name in ["df_search_request.str", "df_search_reply.str"] {
         let message = message(name);
         let bytes = &message.content().unwrap()[..];
-        let content = Content::parse_in(Dialect::Jade, bytes).unwrap();
-        let printer = Printer::new().dialect(Dialect::Jade);
+        let content = Content::parse_in(SlDialect::Jade, bytes).unwrap();
+        let printer = Printer::new().dialect(SlDialect::Jade);
         assert_eq!(printer.print(&content).unwrap(), bytes, "{name}");
         assert_eq!(Content::parse(bytes).as_ref(), Ok(&content));
         // The standard notation of this content is the same.
@@ -97,11 +97,11 @@ enum Cause {
 fn a_failure_of_the_message_transport_is_read_and_written_as_jade_does() {
     let message = message("failure_unknown_agent.str");
     let bytes = &message.content().unwrap()[..];
-    let content = Content::parse_in(Dialect::Jade, bytes).unwrap();
+    let content = Content::parse_in(SlDialect::Jade, bytes).unwrap();
     let printer = Printer::new().jade_failure();
     assert_eq!(printer.print(&content).unwrap(), bytes);
     // The output of SLCodec differs only in blanks.
-    let line = Printer::new().dialect(Dialect::Jade).print(&content);
+    let line = Printer::new().dialect(SlDialect::Jade).print(&content);
     assert_eq!(Content::parse(&line.unwrap()).as_ref(), Ok(&content));
 
     let (action, reason) = content.refusal().unwrap();
@@ -139,7 +139,7 @@ fn content_that_is_no_sl_is_refused() {
 #[test]
 fn deviations_of_jade_are_read_and_written() {
     let text = "((p \"true\" TRUE #4\"aGk= ??meta \"é\" .5 (+ 1 2) (a :\"b c\" 1)) ??formula )";
-    let content = Content::parse_in(Dialect::Jade, text).unwrap();
+    let content = Content::parse_in(SlDialect::Jade, text).unwrap();
     let [first, second] = &content.expressions[..] else {
         panic!("two expressions");
     };
@@ -151,7 +151,7 @@ fn deviations_of_jade_are_read_and_written() {
     assert_eq!(arguments[2], Term::Bytes(b"hi"[..].into()));
     assert_eq!(arguments[3], Term::Meta("meta".into()));
     assert_eq!(*second, Wff::Meta("formula".into()).into());
-    let written = Printer::new().dialect(Dialect::Jade).print(&content);
+    let written = Printer::new().dialect(SlDialect::Jade).print(&content);
     assert_eq!(written.unwrap(), text.replace("TRUE", "true").as_bytes());
     // In the standard, the bytes are text.
     let standard: String = from_slice("#4\"aGk=").unwrap();

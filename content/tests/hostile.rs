@@ -5,8 +5,8 @@
 use std::thread;
 
 use fipa_content::{
-    Content, DeserializeErrorKind, Dialect, MAX_DEPTH, MAX_NODES, PrintError, Printer, Problem,
-    SerializeError, Term, from_slice, to_vec,
+    Content, DeserializeErrorKind, MAX_DEPTH, MAX_NODES, PrintError, Printer, Problem,
+    SerializeError, SlDialect, Term, from_slice, to_vec,
 };
 use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
@@ -149,7 +149,7 @@ fn large_text_is_read_once() {
     ] {
         let text = piece.repeat(SIZE / piece.len());
         let _ = Term::parse(&text);
-        let _ = Content::parse_in(Dialect::Jade, &text);
+        let _ = Content::parse_in(SlDialect::Jade, &text);
         let _ = from_slice::<IgnoredAny>(&text);
         let _ = from_slice::<Nested>(&text);
         // Also as the value of an unknown slot.

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
-use fipa_content::{Dialect, Printer, Set, Term, from_slice, from_slice_in, to_vec, to_vec_in};
+use fipa_content::{Printer, Set, SlDialect, Term, from_slice, from_slice_in, to_vec, to_vec_in};
 use proptest::collection::{btree_map, btree_set, vec};
 use proptest::option;
 use proptest::prelude::*;
@@ -95,8 +95,8 @@ proptest! {
         let text = to_vec(&term).unwrap();
         prop_assert_eq!(&text, &Printer::new().print(&term).unwrap());
         prop_assert_eq!(&from_slice::<Term<'_>>(&text).unwrap(), &term);
-        if let Ok(text) = to_vec_in(Dialect::Jade, &term) {
-            prop_assert_eq!(&from_slice_in::<Term<'_>>(Dialect::Jade, &text).unwrap(), &term);
+        if let Ok(text) = to_vec_in(SlDialect::Jade, &term) {
+            prop_assert_eq!(&from_slice_in::<Term<'_>>(SlDialect::Jade, &text).unwrap(), &term);
         }
         let json = serde_json::to_vec(&term).unwrap();
         if std::str::from_utf8(&text).is_ok() {
@@ -122,8 +122,8 @@ proptest! {
         let term = Term::parse(&text).unwrap();
         prop_assert_eq!(&term.read::<Everything>().unwrap(), &value);
         prop_assert_eq!(Term::from_value(&value).unwrap(), term);
-        if let Ok(text) = to_vec_in(Dialect::Jade, &value) {
-            prop_assert_eq!(&from_slice_in::<Everything>(Dialect::Jade, &text).unwrap(), &value);
+        if let Ok(text) = to_vec_in(SlDialect::Jade, &value) {
+            prop_assert_eq!(&from_slice_in::<Everything>(SlDialect::Jade, &text).unwrap(), &value);
         }
     }
 }

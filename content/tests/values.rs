@@ -7,8 +7,8 @@ use std::fmt::Debug;
 
 use fipa_acl::{AgentId, Time};
 use fipa_content::{
-    Agent, DateTime, DeserializeError, DeserializeErrorKind, Dialect, ParseError, PrintError,
-    Problem, SerializeError, Set, Term, from_slice, from_slice_in, to_vec, to_vec_in,
+    Agent, DateTime, DeserializeError, DeserializeErrorKind, ParseError, PrintError, Problem,
+    SerializeError, Set, SlDialect, Term, from_slice, from_slice_in, to_vec, to_vec_in,
 };
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -213,7 +213,7 @@ fn strings_that_look_like_something_else_are_quoted() {
     same("a \"b\"".to_owned(), r#""a \"b\"""#);
     same(r"C:\".to_owned(), r#"#3"C:\"#);
     same('é', "é");
-    assert_eq!(to_vec_in(Dialect::Jade, "é").unwrap(), "\"é\"".as_bytes());
+    assert_eq!(to_vec_in(SlDialect::Jade, "é").unwrap(), "\"é\"".as_bytes());
     same(true, "true");
     assert!(from_slice::<bool>("TRUE").unwrap());
     assert!(from_slice::<bool>("\"true\"").is_err());
@@ -255,12 +255,12 @@ fn integers_of_every_size() {
     assert_eq!(error.problem(), &Problem::NumberRange);
     // JADE has 64 bits with a sign.
     assert_eq!(
-        to_vec_in(Dialect::Jade, &i64::MAX).unwrap(),
+        to_vec_in(SlDialect::Jade, &i64::MAX).unwrap(),
         b"9223372036854775807"
     );
     for refused in [
-        to_vec_in(Dialect::Jade, &(1_u64 << 63)),
-        to_vec_in(Dialect::Jade, &i128::MIN),
+        to_vec_in(SlDialect::Jade, &(1_u64 << 63)),
+        to_vec_in(SlDialect::Jade, &i128::MIN),
     ] {
         assert!(matches!(
             refused,
@@ -339,10 +339,10 @@ fn bytes_are_counted_and_base64_for_jade() {
             [format!("#{}\"", bytes.len()).as_bytes(), bytes].concat()
         );
         assert_eq!(from_slice::<Bytes>(&written).unwrap(), value);
-        let written = to_vec_in(Dialect::Jade, &value).unwrap();
+        let written = to_vec_in(SlDialect::Jade, &value).unwrap();
         assert!(written.is_ascii());
         assert_eq!(
-            from_slice_in::<Bytes>(Dialect::Jade, &written).unwrap(),
+            from_slice_in::<Bytes>(SlDialect::Jade, &written).unwrap(),
             value
         );
     }
@@ -359,7 +359,7 @@ fn times_agents_and_terms_are_parts_of_values() {
     ));
     let relative: Time = "+00000000T000030000".parse().unwrap();
     same(Some(DateTime(relative)), "+00000000T000030000");
-    assert!(to_vec_in(Dialect::Jade, &DateTime(relative)).is_err());
+    assert!(to_vec_in(SlDialect::Jade, &DateTime(relative)).is_err());
 
     let agent = AgentId::new("crex")
         .unwrap()

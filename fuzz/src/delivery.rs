@@ -25,8 +25,8 @@ use fipa_mts::letter_for;
 use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
 use fipa_transport::{
     Answer, Arrival, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation,
-    Introduction, Kind, LegacySource, Location, Mandate, Outcome, Parcel, Principal, Report,
-    Signature, Stream, Ticket, TransportError, TransportErrorKind, Verdict,
+    Introduction, Kind, LegacySource, Location, Mandate, Outcome, Parcel, Principal, Reaction,
+    Report, Signature, Stream, Ticket, TransportError, TransportErrorKind,
 };
 
 use crate::input::Input;
@@ -520,7 +520,7 @@ impl World {
         let now = self.clocks();
         let core = &mut self.service(at).core;
         let verdict = core.handle_arrival(now, via, arrival);
-        assert!(!at_once || verdict != Verdict::Later);
+        assert!(!at_once || verdict != Reaction::Later);
         self.carry_out(at);
     }
 
@@ -910,11 +910,11 @@ impl World {
         let now = self.clocks();
         let service = self.service(to);
         match service.core.handle_arrival(now, kind, arrival) {
-            Verdict::Now(answer) => {
+            Reaction::Now(answer) => {
                 let coming = Coming::Conclusion(attempt, Conclusion::Answered(answer));
                 self.coming.push_back((self.now + DELAY, from, coming));
             }
-            Verdict::Later => {
+            Reaction::Later => {
                 service.tickets.insert(ticket.0, (from, attempt));
             }
         }

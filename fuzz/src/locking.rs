@@ -6,7 +6,7 @@
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_locking::{
-    Act, Action, AnyAlgorithm, Content, Event, Fence, Kind, Locks, Options, OwnerState, Peer,
+    Act, Action, Algorithm, AnyAlgorithm, Content, Event, Fence, Locks, Options, OwnerState, Peer,
     Resource, codec,
 };
 
@@ -28,7 +28,7 @@ fn bay() -> Resource {
 }
 
 /// Returns the content of a message with this performative, sometimes with some of its bytes replaced.
-fn content(input: &mut Input<'_>, act: &Performative, kind: Kind) -> Vec<u8> {
+fn content(input: &mut Input<'_>, act: &Performative, kind: Algorithm) -> Vec<u8> {
     let number = u32::from(input.byte());
     let resource = input.one_of(&["bay", "bay", "bay", "dock"]);
     let fence = format!(
@@ -38,8 +38,8 @@ fn content(input: &mut Input<'_>, act: &Performative, kind: Kind) -> Vec<u8> {
         input.one_of(&["crane", "arm"])
     );
     let text = match (act, input.below(3)) {
-        (Performative::Request, 0 | 1) if kind == Kind::OwnerQueue => resource.to_owned(),
-        (Performative::Request | Performative::Agree, _) if kind == Kind::OwnerQueue => {
+        (Performative::Request, 0 | 1) if kind == Algorithm::OwnerQueue => resource.to_owned(),
+        (Performative::Request | Performative::Agree, _) if kind == Algorithm::OwnerQueue => {
             format!("{resource}\n{}", number % 10)
         }
         (Performative::Request | Performative::Agree, _) if kind.has_token() => {
@@ -69,7 +69,7 @@ fn content(input: &mut Input<'_>, act: &Performative, kind: Kind) -> Vec<u8> {
     content
 }
 
-fn message(input: &mut Input<'_>, kind: Kind, from: &Peer) -> Option<Message> {
+fn message(input: &mut Input<'_>, kind: Algorithm, from: &Peer) -> Option<Message> {
     let act = input.one_of(&[
         Performative::Request,
         Performative::Agree,
@@ -107,7 +107,7 @@ fn message(input: &mut Input<'_>, kind: Kind, from: &Peer) -> Option<Message> {
 /// Runs an owner with the messages and timeouts that the bytes encode.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
-    let kind = input.one_of(&Kind::ALL);
+    let kind = input.one_of(&Algorithm::ALL);
     let me = Peer::new("crane", 7).expect("a name");
     let mut locks: Locks<AnyAlgorithm> = Locks::new(me, kind, Options::default());
     let (mut now, mut out) = (0, Vec::new());

@@ -9,8 +9,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_platform::{
-    AgentDescription, Ams, AmsDescription, ApDescription, Asker, Constraints, Df, Function, Now,
-    ONTOLOGY, Platform, RemoteEntry, Resident, ServiceDescription, found, limits, subscription,
+    AgentDescription, Ams, AmsDescription, ApDescription, Asker, Constraints, Df, Function,
+    ONTOLOGY, Platform, PlatformTime, RemoteEntry, Resident, ServiceDescription, found, limits,
+    subscription,
 };
 
 use crate::input::Input;
@@ -42,7 +43,7 @@ fn asker(input: &mut Input<'_>) -> Asker {
     let mut asker = Asker::new(id(name), u64::from(input.byte()), platform);
     asker.is_proved = input.below(4) != 0;
     if input.below(4) == 0 {
-        asker.dialect = fipa_content::Dialect::Jade;
+        asker.dialect = fipa_content::SlDialect::Jade;
     }
     if name == HONEST && platform == Platform::Host {
         asker.is_proved = false;
@@ -91,7 +92,7 @@ fn content(input: &mut Input<'_>) -> Vec<u8> {
 
 /// Returns what the directory facilitators of other hosts sent: valid texts, some of them with other
 /// bytes, or any text.
-fn remote(input: &mut Input<'_>, now: Now) -> Vec<RemoteEntry> {
+fn remote(input: &mut Input<'_>, now: PlatformTime) -> Vec<RemoteEntry> {
     let one = |input: &mut Input<'_>| {
         let name = input.one_of(&NAMES);
         let text = match input.below(6) {
@@ -144,7 +145,7 @@ fn message(input: &mut Input<'_>, from: &Asker) -> Option<Message> {
 /// Runs both agents with the messages and events that the bytes encode.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
-    let mut now = Now {
+    let mut now = PlatformTime {
         at: Instant::now(),
         wall: SystemTime::UNIX_EPOCH + Duration::from_secs(1_795_348_800),
     };

@@ -18,8 +18,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::{
-    Act, Action, Algorithm, ClaimId, Content, Conversation, Ending, Event, Fence, LockMessage,
-    Locks, Millis, Peer, Resource,
+    Act, Action, ClaimId, Content, Conversation, Ending, Event, Fence, LockMessage, Locks, Millis,
+    MutualExclusion, Peer, Resource,
 };
 
 /// A broken invariant.
@@ -387,7 +387,7 @@ impl Turns {
 
 /// Whether a claim holds all its resources or none (invariant 8), once it is acquired or has ended.
 #[must_use]
-pub fn all_or_none<A: Algorithm>(
+pub fn all_or_none<A: MutualExclusion>(
     agent: &Locks<A>,
     now: Millis,
     claim: ClaimId,

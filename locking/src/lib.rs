@@ -7,7 +7,7 @@
 //!
 //! * [`Locks`] is the core of one agent: requester, member, owner and holder of any number of
 //!   resources. It has no I/O and no clock: messages and `now` go in, [`Action`]s come out.
-//! * [`Algorithm`] is the interface of the algorithms. With [`OwnerQueue`], the default, agents ask the owner
+//! * [`MutualExclusion`] is the interface of the algorithms. With [`OwnerQueue`], the default, agents ask the owner
 //!   only, which serves them in the order of arrival. [`RicartAgrawala`] is permission based
 //!   (Ricart and Agrawala, *An optimal algorithm for mutual exclusion in computer networks*, CACM
 //!   24(1), 1981). [`SuzukiKasami`] is token based (Suzuki and Kasami, *A distributed mutual
@@ -26,12 +26,12 @@
 //! (`CLOCK_BOOTTIME`). Rates of two clocks may differ by up to 2 %.
 //!
 //! ```
-//! use fipa_locking::{Action, AnyAlgorithm, Kind, Event, Locks, Options, Peer, OwnerState, Resource};
+//! use fipa_locking::{Action, AnyAlgorithm, Algorithm, Event, Locks, Options, Peer, OwnerState, Resource};
 //!
 //! let bay = Resource::new("bay")?;
 //! let options = Options::default();
 //! let mut crane: Locks<AnyAlgorithm> =
-//!     Locks::new(Peer::new("crane", 1)?, Kind::OwnerQueue, options);
+//!     Locks::new(Peer::new("crane", 1)?, Algorithm::OwnerQueue, options);
 //! let mut actions = Vec::new();
 //! // The state has to be written and synced before `own` is called.
 //! let state = OwnerState::first().next_life(options.lease);
@@ -70,13 +70,13 @@ mod queue;
 mod state_file;
 
 pub use algorithm::{
-    Algorithm, AnyAlgorithm, Context, Gate, Kind, Member, OwnerQueue, RicartAgrawala, Step,
-    SuzukiKasami,
+    Algorithm, AnyAlgorithm, Context, Gate, Member, MutualExclusion, OwnerQueue, RicartAgrawala,
+    Step, SuzukiKasami,
 };
 pub use fence::{Admission, Fence, FenceError, NotAdmitted};
 pub use holder::{Holder, HolderStep};
 pub use locks::{Action, ClaimId, Event, Failure, LockStatus, Locks};
-pub use message::{Act, Content, Dialect, LockMessage, Refusal, Token};
+pub use message::{Act, Content, LockDialect, LockMessage, Refusal, Token};
 pub use names::{Conversation, MAX_NAME, Millis, NameError, Peer, Resource};
 pub use options::{Options, OptionsError};
 pub use owner::{Ending, Grant, Owner, OwnerStep};

@@ -4,18 +4,18 @@ use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 use std::sync::Arc;
 
-use crate::{Conversation, Fence, Kind, Millis, Resource};
+use crate::{Algorithm, Conversation, Fence, Millis, Resource};
 
 /// A message between the cores of two agents.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LockMessage {
     /// The conversation. An answer has that of the message it answers.
     pub conversation: Conversation,
-    /// Dialect of the sender.
-    pub dialect: Dialect,
-    /// Algorithm of an act that belongs to one, or the one that an owner names with [`Act::Owned`]. `None` for
+    /// LockDialect of the sender.
+    pub dialect: LockDialect,
+    /// MutualExclusion of an act that belongs to one, or the one that an owner names with [`Act::Owned`]. `None` for
     /// other acts, and for that of the resource.
-    pub algorithm: Option<Kind>,
+    pub algorithm: Option<Algorithm>,
     /// Content of the message.
     pub content: Content,
 }
@@ -26,7 +26,7 @@ pub struct LockMessage {
     clippy::exhaustive_enums,
     reason = "an agent requests grants, or it does not"
 )]
-pub enum Dialect {
+pub enum LockDialect {
     /// This library: the agent requests a grant with a fence.
     Own,
     /// `distributed_locking`, or an unknown implementation: the agent requests no fence.
@@ -140,7 +140,7 @@ pub enum Refusal {
     /// The receiver does not own the resource.
     NotOwner,
     /// The agents that use the resource use this algorithm.
-    Algorithm(Kind),
+    Algorithm(Algorithm),
 }
 
 impl Refusal {
@@ -148,11 +148,11 @@ impl Refusal {
         Self::NotLive,
         Self::Closed,
         Self::NotOwner,
-        Self::Algorithm(Kind::OwnerQueue),
-        Self::Algorithm(Kind::RicartAgrawala),
-        Self::Algorithm(Kind::RicartAgrawalaExtended),
-        Self::Algorithm(Kind::SuzukiKasami),
-        Self::Algorithm(Kind::SuzukiKasamiExtended),
+        Self::Algorithm(Algorithm::OwnerQueue),
+        Self::Algorithm(Algorithm::RicartAgrawala),
+        Self::Algorithm(Algorithm::RicartAgrawalaExtended),
+        Self::Algorithm(Algorithm::SuzukiKasami),
+        Self::Algorithm(Algorithm::SuzukiKasamiExtended),
     ];
 
     /// Words in a message.
@@ -162,11 +162,13 @@ impl Refusal {
             Self::NotLive => "not-live",
             Self::Closed => "closed",
             Self::NotOwner => "not-owner",
-            Self::Algorithm(Kind::OwnerQueue) => "algorithm owner_queue",
-            Self::Algorithm(Kind::RicartAgrawala) => "algorithm ricart_agrawala",
-            Self::Algorithm(Kind::RicartAgrawalaExtended) => "algorithm ricart_agrawala_extended",
-            Self::Algorithm(Kind::SuzukiKasami) => "algorithm suzuki_kasami",
-            Self::Algorithm(Kind::SuzukiKasamiExtended) => "algorithm suzuki_kasami_extended",
+            Self::Algorithm(Algorithm::OwnerQueue) => "algorithm owner_queue",
+            Self::Algorithm(Algorithm::RicartAgrawala) => "algorithm ricart_agrawala",
+            Self::Algorithm(Algorithm::RicartAgrawalaExtended) => {
+                "algorithm ricart_agrawala_extended"
+            }
+            Self::Algorithm(Algorithm::SuzukiKasami) => "algorithm suzuki_kasami",
+            Self::Algorithm(Algorithm::SuzukiKasamiExtended) => "algorithm suzuki_kasami_extended",
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Times of the core.
 
 use crate::faults::Fault;
-use crate::{Kind, Millis};
+use crate::{Algorithm, Millis};
 
 /// Times of the core of one agent, in milliseconds, and its algorithm with agents of `distributed_locking`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -22,9 +22,9 @@ pub struct Options {
     pub claim: Millis,
     /// Number of the first conversation. A restarted agent should not use its earlier numbers.
     pub first_conversation: u64,
-    /// Algorithm with agents of `distributed_locking`, for an agent whose own is the owner's queue (default:
+    /// MutualExclusion with agents of `distributed_locking`, for an agent whose own is the owner's queue (default:
     /// the extended Ricart-Agrawala).
-    pub legacy_algorithm: Kind,
+    pub legacy_algorithm: Algorithm,
     /// Whether agents of `distributed_locking` use the resources that this agent owns (default: no). Then these
     /// have the algorithm for such agents.
     pub legacy_peers: bool,
@@ -41,7 +41,7 @@ impl Default for Options {
             discovery: 2_000,
             claim: 1_000,
             first_conversation: 0,
-            legacy_algorithm: Kind::RicartAgrawalaExtended,
+            legacy_algorithm: Algorithm::RicartAgrawalaExtended,
             legacy_peers: false,
             fault: Fault::NO,
         }

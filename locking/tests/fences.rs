@@ -4,8 +4,8 @@
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 use fipa_locking::{
-    Act, Action, AnyAlgorithm, Content, Conversation, Dialect, Event, Fence, Kind, LockMessage,
-    Locks, Millis, Options, OwnerState, Peer, Resource,
+    Act, Action, Algorithm, AnyAlgorithm, Content, Conversation, Event, Fence, LockDialect,
+    LockMessage, Locks, Millis, Options, OwnerState, Peer, Resource,
 };
 
 const LEASE: Millis = 15_000;
@@ -33,7 +33,7 @@ struct Agent {
 
 impl Agent {
     fn new(name: &str, registration: u64) -> Self {
-        let kind = Kind::RicartAgrawalaExtended;
+        let kind = Algorithm::RicartAgrawalaExtended;
         Self {
             locks: Locks::new(peer(name, registration), kind, Options::default()),
             now: 0,
@@ -46,7 +46,9 @@ impl Agent {
         let mut crane = Self::new("crane", 2);
         for member in ["rover", "arm"] {
             let member = peer(member, 1);
-            crane.locks.join(0, &member, Dialect::Own, &mut crane.out);
+            crane
+                .locks
+                .join(0, &member, LockDialect::Own, &mut crane.out);
         }
         crane
             .locks
@@ -65,7 +67,7 @@ impl Agent {
     fn receive(&mut self, from: &Peer, conversation: &str, act: Act) {
         let message = LockMessage {
             conversation: Conversation::parse(conversation),
-            dialect: Dialect::Own,
+            dialect: LockDialect::Own,
             algorithm: None,
             content: Content::Lock {
                 resource: bay(),
@@ -246,7 +248,7 @@ fn rover() -> Agent {
     let crane = peer("crane", 1);
     rover
         .locks
-        .owner_known(0, &bay(), &crane, Dialect::Own, &mut rover.out);
+        .owner_known(0, &bay(), &crane, LockDialect::Own, &mut rover.out);
     let claim = rover.locks.lock(0, &bay(), None, &mut rover.out);
     rover.receive(&crane, "rover_0", Act::Agree { clock: 1 });
     let granted = Act::Granted {
@@ -274,7 +276,7 @@ fn an_agent_tells_an_owner_that_starts_the_highest_fence() {
     let mut listed = rover();
     listed
         .locks
-        .owner_known(0, &bay(), &next, Dialect::Own, &mut listed.out);
+        .owner_known(0, &bay(), &next, LockDialect::Own, &mut listed.out);
     assert_eq!(listed.took().1, [SEEN]);
     // Another owner learns nothing.
     let mut asked = rover();
@@ -285,7 +287,7 @@ fn an_agent_tells_an_owner_that_starts_the_highest_fence() {
     let mut asked = rover();
     let legacy = LockMessage {
         conversation: Conversation::parse("crane_discover_1"),
-        dialect: Dialect::Legacy,
+        dialect: LockDialect::Legacy,
         algorithm: None,
         content: Content::Lock {
             resource: bay(),

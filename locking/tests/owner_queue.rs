@@ -5,11 +5,11 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use fipa_locking::{
-    Act, Action, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Event, Failure, Fence,
-    Kind, LockMessage, Locks, Millis, Options, OwnerState, Peer, Refusal, Resource,
+    Act, Action, Algorithm, AnyAlgorithm, ClaimId, Content, Conversation, Event, Failure, Fence,
+    LockDialect, LockMessage, Locks, Millis, Options, OwnerState, Peer, Refusal, Resource,
 };
 
-const OWN: Dialect = Dialect::Own;
+const OWN: LockDialect = LockDialect::Own;
 const LEASE: Millis = 15_000;
 
 fn bay() -> Resource {
@@ -39,11 +39,11 @@ impl Net {
     /// `crane` owns the resource. The members know it.
     fn new(members: &[&str]) -> Self {
         let mut net = Self::default();
-        net.start("crane", 1, Kind::OwnerQueue, Options::default());
+        net.start("crane", 1, Algorithm::OwnerQueue, Options::default());
         net.own("crane", OwnerState::first().next_life(LEASE));
         net.run(1_000);
         for member in members {
-            net.start(member, 1, Kind::OwnerQueue, Options::default());
+            net.start(member, 1, Algorithm::OwnerQueue, Options::default());
         }
         net.clear();
         net
@@ -55,7 +55,7 @@ impl Net {
         self.events.clear();
     }
 
-    fn start(&mut self, name: &str, registration: u64, kind: Kind, mut options: Options) {
+    fn start(&mut self, name: &str, registration: u64, kind: Algorithm, mut options: Options) {
         options.first_conversation = registration * 1_000;
         let me = Peer::new(name, registration).unwrap();
         self.agents
@@ -156,7 +156,7 @@ impl Net {
         let (crane, owns) = (owner.me().clone(), owner.owner(&bay()).is_some());
         let claim = self.call(name, |locks, now, out| {
             if owns {
-                locks.owner_named(now, &bay(), &crane, OWN, Some(Kind::OwnerQueue), out);
+                locks.owner_named(now, &bay(), &crane, OWN, Some(Algorithm::OwnerQueue), out);
             }
             locks.lock(now, &bay(), within, out)
         });
@@ -182,7 +182,12 @@ impl Net {
             self.depart(other, &before);
         }
         let registration = before.registration() + 1;
-        self.start("crane", registration, Kind::OwnerQueue, Options::default());
+        self.start(
+            "crane",
+            registration,
+            Algorithm::OwnerQueue,
+            Options::default(),
+        );
         self.own("crane", state);
         self.deliver();
     }
@@ -274,12 +279,12 @@ fn a_lock_without_contention_needs_three_letters() {
 /// Most agents of a domain use no locks, and do not answer a greeting. Only Ricart-Agrawala has to wait for it.
 #[test]
 fn a_request_to_a_queue_does_not_wait_for_answers_to_greetings() {
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         let mut net = Net::default();
         net.start("crane", 1, kind, Options::default());
         net.own("crane", OwnerState::first().next_life(LEASE));
         net.run(1_000);
-        net.start("a", 1, Kind::default(), Options::default());
+        net.start("a", 1, Algorithm::default(), Options::default());
         let silent = Peer::new("silent", 1).unwrap();
         let claim = net.call("a", |locks, now, out| {
             locks.expect(now, &silent);
@@ -449,7 +454,7 @@ fn a_release_of_an_earlier_life_ends_no_grant() {
     let (to, from, late) = net.under_way.pop_front().unwrap();
     // The agent restarts, and gets the resource before its late release arrives.
     net.depart("crane", &from);
-    net.start("a", 2, Kind::OwnerQueue, Options::default());
+    net.start("a", 2, Algorithm::OwnerQueue, Options::default());
     let second = net.lock("a");
     net.call(to.name(), |locks, now, out| {
         locks.handle(now, &from, &late, out);
@@ -495,7 +500,7 @@ fn requests_of_the_life_before_are_sorted_by_their_places() {
     }
     net.cut.extend(["a", "b", "c", "d", "e"].map(str::to_owned));
     let before = net.agents.remove("crane").unwrap().me().clone();
-    net.start("crane", 2, Kind::OwnerQueue, Options::default());
+    net.start("crane", 2, Algorithm::OwnerQueue, Options::default());
     net.own(
         "crane",
         OwnerState::first().next_life(LEASE).next_life(LEASE),
@@ -522,7 +527,7 @@ fn after_the_silence_a_place_of_the_life_before_does_not_count() {
     net.lock("c");
     let before = net.agents.remove("crane").unwrap().me().clone();
     net.cut.extend(["b", "c"].map(str::to_owned));
-    net.start("crane", 2, Kind::OwnerQueue, Options::default());
+    net.start("crane", 2, Algorithm::OwnerQueue, Options::default());
     net.own("crane", OwnerState::first().next_life(LEASE));
     net.run(1_000);
     net.lock("d");
@@ -580,12 +585,12 @@ fn two_owners_have_a_queue_each() {
     let mut net = Net::new(&["a"]);
     let claim = net.lock("a");
     let fence = net.agents["a"].fence(net.now, claim, &bay()).unwrap();
-    net.start("derrick", 1, Kind::OwnerQueue, Options::default());
+    net.start("derrick", 1, Algorithm::OwnerQueue, Options::default());
     net.cut.insert("derrick".to_owned());
     net.own("derrick", OwnerState::first().next_life(LEASE));
     net.run(1_000);
     net.cut = BTreeSet::from(["crane".to_owned()]);
-    net.start("b", 1, Kind::OwnerQueue, Options::default());
+    net.start("b", 1, Algorithm::OwnerQueue, Options::default());
     net.cut.clear();
     let derrick = net.agents["derrick"].me().clone();
     let other = net.call("b", |locks, now, out| {
@@ -617,7 +622,7 @@ fn two_owners_have_a_queue_each() {
 // ----- algorithms
 
 /// An owner with one algorithm, and a member that was told to use another. The member finds the owner by messages.
-fn found(of_owner: Kind, of_member: Kind) -> (Net, ClaimId) {
+fn found(of_owner: Algorithm, of_member: Algorithm) -> (Net, ClaimId) {
     let mut net = Net::default();
     net.start("crane", 1, of_owner, Options::default());
     net.own("crane", OwnerState::first().next_life(LEASE));
@@ -631,15 +636,15 @@ fn found(of_owner: Kind, of_member: Kind) -> (Net, ClaimId) {
 
 #[test]
 fn a_member_without_an_option_uses_the_algorithm_that_the_owner_names() {
-    for kind in Kind::ALL {
-        let (net, claim) = found(kind, Kind::default());
+    for kind in Algorithm::ALL {
+        let (net, claim) = found(kind, Algorithm::default());
         assert!(
             net.agents["a"].fence(net.now, claim, &bay()).is_some(),
             "{kind}"
         );
         let asked = net.sent.iter().filter(|(from, ..)| from == "a");
         let used = |act: &Act| match act {
-            Act::Ask { .. } => kind == Kind::OwnerQueue,
+            Act::Ask { .. } => kind == Algorithm::OwnerQueue,
             Act::Request { .. } => kind.needs_permission(),
             Act::RequestToken { .. } => kind.has_token(),
             _ => true,
@@ -650,9 +655,9 @@ fn a_member_without_an_option_uses_the_algorithm_that_the_owner_names() {
 
 #[test]
 fn a_member_with_another_algorithm_is_refused_with_a_text() {
-    for of_owner in Kind::ALL {
-        for of_member in Kind::ALL {
-            if of_member == Kind::OwnerQueue || of_member == of_owner {
+    for of_owner in Algorithm::ALL {
+        for of_member in Algorithm::ALL {
+            if of_member == Algorithm::OwnerQueue || of_member == of_owner {
                 continue;
             }
             let (mut net, _) = found(of_owner, of_member);
@@ -673,7 +678,7 @@ fn a_member_with_another_algorithm_is_refused_with_a_text() {
     }
 }
 
-fn letter(kind: Kind, conversation: &str, dialect: Dialect, act: Act) -> LockMessage {
+fn letter(kind: Algorithm, conversation: &str, dialect: LockDialect, act: Act) -> LockMessage {
     LockMessage {
         conversation: Conversation::parse(conversation),
         dialect,
@@ -691,18 +696,26 @@ fn letter(kind: Kind, conversation: &str, dialect: Dialect, act: Act) -> LockMes
 fn an_owner_refuses_requests_of_other_algorithms_and_reports_them() {
     let asked = 7;
     let requests = [
-        (Kind::OwnerQueue, Act::Ask { asked, place: None }, asked),
-        (Kind::RicartAgrawala, Act::Request { clock: 1 }, 0),
-        (Kind::SuzukiKasami, Act::RequestToken { number: 1 }, 0),
         (
-            Kind::RicartAgrawalaExtended,
+            Algorithm::OwnerQueue,
+            Act::Ask { asked, place: None },
+            asked,
+        ),
+        (Algorithm::RicartAgrawala, Act::Request { clock: 1 }, 0),
+        (Algorithm::SuzukiKasami, Act::RequestToken { number: 1 }, 0),
+        (
+            Algorithm::RicartAgrawalaExtended,
             Act::Confirm { asked: Some(asked) },
             asked,
         ),
-        (Kind::SuzukiKasamiExtended, Act::Confirm { asked: None }, 0),
+        (
+            Algorithm::SuzukiKasamiExtended,
+            Act::Confirm { asked: None },
+            0,
+        ),
     ];
-    for of_owner in Kind::ALL {
-        for dialect in [OWN, Dialect::Legacy] {
+    for of_owner in Algorithm::ALL {
+        for dialect in [OWN, LockDialect::Legacy] {
             for (kind, act, asked) in requests.iter().cloned() {
                 if kind == of_owner {
                     continue;
@@ -746,7 +759,7 @@ fn an_owner_refuses_requests_of_other_algorithms_and_reports_them() {
             }
         }
     }
-    let text = Refusal::Algorithm(Kind::OwnerQueue).to_string();
+    let text = Refusal::Algorithm(Algorithm::OwnerQueue).to_string();
     assert_eq!(text, "the resource uses the algorithm owner_queue");
 }
 
@@ -754,24 +767,24 @@ fn an_owner_refuses_requests_of_other_algorithms_and_reports_them() {
 #[test]
 fn a_refused_request_is_made_again_with_the_algorithm_of_the_refusal() {
     for (stale, kind) in [
-        (Kind::RicartAgrawalaExtended, Kind::OwnerQueue),
-        (Kind::OwnerQueue, Kind::RicartAgrawalaExtended),
-        (Kind::OwnerQueue, Kind::SuzukiKasamiExtended),
+        (Algorithm::RicartAgrawalaExtended, Algorithm::OwnerQueue),
+        (Algorithm::OwnerQueue, Algorithm::RicartAgrawalaExtended),
+        (Algorithm::OwnerQueue, Algorithm::SuzukiKasamiExtended),
     ] {
         let mut net = Net::default();
         net.start("crane", 1, kind, Options::default());
         net.own("crane", OwnerState::first().next_life(LEASE));
         net.run(1_000);
         let crane = net.agents["crane"].me().clone();
-        net.start("a", 1, Kind::default(), Options::default());
+        net.start("a", 1, Algorithm::default(), Options::default());
         // The announcement of the owner is lost.
         net.agents.remove("a");
-        net.start("b", 1, Kind::default(), Options::default());
+        net.start("b", 1, Algorithm::default(), Options::default());
         net.agents.insert(
             "a".to_owned(),
             Locks::new(
                 Peer::new("a", 1).unwrap(),
-                Kind::default(),
+                Algorithm::default(),
                 Options::default(),
             ),
         );
@@ -791,19 +804,19 @@ fn a_refused_request_is_made_again_with_the_algorithm_of_the_refusal() {
 fn the_owner_of_a_resource_for_legacy_agents_uses_an_algorithm_of_theirs() {
     for (kind, legacy_algorithm, expected) in [
         (
-            Kind::OwnerQueue,
-            Kind::RicartAgrawalaExtended,
-            Kind::RicartAgrawalaExtended,
+            Algorithm::OwnerQueue,
+            Algorithm::RicartAgrawalaExtended,
+            Algorithm::RicartAgrawalaExtended,
         ),
         (
-            Kind::OwnerQueue,
-            Kind::SuzukiKasamiExtended,
-            Kind::SuzukiKasamiExtended,
+            Algorithm::OwnerQueue,
+            Algorithm::SuzukiKasamiExtended,
+            Algorithm::SuzukiKasamiExtended,
         ),
         (
-            Kind::SuzukiKasami,
-            Kind::RicartAgrawalaExtended,
-            Kind::SuzukiKasami,
+            Algorithm::SuzukiKasami,
+            Algorithm::RicartAgrawalaExtended,
+            Algorithm::SuzukiKasami,
         ),
     ] {
         let mut options = Options::default();
@@ -824,20 +837,23 @@ fn the_owner_of_a_resource_for_legacy_agents_uses_an_algorithm_of_theirs() {
 
 #[test]
 fn at_an_owner_of_the_cpp_library_the_configured_algorithm_of_the_paper_is_used() {
-    for legacy_algorithm in [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended] {
+    for legacy_algorithm in [
+        Algorithm::RicartAgrawalaExtended,
+        Algorithm::SuzukiKasamiExtended,
+    ] {
         let mut options = Options::default();
         options.legacy_algorithm = legacy_algorithm;
         let mut net = Net::default();
-        net.start("a", 1, Kind::OwnerQueue, options);
+        net.start("a", 1, Algorithm::OwnerQueue, options);
         let owner = Peer::new("agent1", 0).unwrap();
         net.call("a", |locks, now, out| {
-            locks.join(now, &owner, Dialect::Legacy, out);
+            locks.join(now, &owner, LockDialect::Legacy, out);
             locks.lock(now, &bay(), None, out)
         });
         let mut owned = letter(
-            Kind::OwnerQueue,
+            Algorithm::OwnerQueue,
             "a_discover_0",
-            Dialect::Legacy,
+            LockDialect::Legacy,
             Act::Owned,
         );
         owned.algorithm = None;
@@ -853,14 +869,14 @@ fn at_an_owner_of_the_cpp_library_the_configured_algorithm_of_the_paper_is_used(
 /// A member that does not know the owner must not keep others waiting, and no resource has two algorithms.
 #[test]
 fn a_member_agrees_to_requests_of_an_algorithm_that_it_does_not_use() {
-    let ra = Kind::RicartAgrawalaExtended;
+    let ra = Algorithm::RicartAgrawalaExtended;
     let asker = Peer::new("b", 1).unwrap();
     let request = letter(ra, "b_1", OWN, Act::Request { clock: 4 });
     // It was told to use another one, it knows an owner with another one, or it is looking for the owner.
     for (kind, owner) in [
-        (Kind::SuzukiKasami, None),
-        (Kind::OwnerQueue, Some(Kind::OwnerQueue)),
-        (Kind::OwnerQueue, None),
+        (Algorithm::SuzukiKasami, None),
+        (Algorithm::OwnerQueue, Some(Algorithm::OwnerQueue)),
+        (Algorithm::OwnerQueue, None),
     ] {
         let mut net = Net::default();
         net.start("a", 1, kind, Options::default());

@@ -3,8 +3,9 @@
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 use fipa_locking::{
-    Act, Action, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Ending, Event, Failure,
-    Fence, Kind, LockMessage, Locks, Millis, Options, OwnerState, Peer, Refusal, Resource, Token,
+    Act, Action, Algorithm, AnyAlgorithm, ClaimId, Content, Conversation, Ending, Event, Failure,
+    Fence, LockDialect, LockMessage, Locks, Millis, Options, OwnerState, Peer, Refusal, Resource,
+    Token,
 };
 
 fn bay() -> Resource {
@@ -23,7 +24,7 @@ struct Agent {
 }
 
 impl Agent {
-    fn new(name: &str, kind: Kind) -> Self {
+    fn new(name: &str, kind: Algorithm) -> Self {
         Self {
             locks: Locks::new(peer(name), kind, Options::default()),
             now: 0,
@@ -32,7 +33,7 @@ impl Agent {
     }
 
     /// An established owner of the bay, with these members.
-    fn owner(name: &str, kind: Kind, members: &[(&str, Dialect)]) -> Self {
+    fn owner(name: &str, kind: Algorithm, members: &[(&str, LockDialect)]) -> Self {
         let mut owner = Self::new(name, kind);
         for (member, dialect) in members {
             owner.locks.join(0, &peer(member), *dialect, &mut owner.out);
@@ -45,7 +46,7 @@ impl Agent {
     }
 
     /// Lets the agent know the owner of the bay.
-    fn owned_by(&mut self, owner: &str, dialect: Dialect) {
+    fn owned_by(&mut self, owner: &str, dialect: LockDialect) {
         self.locks
             .owner_known(0, &bay(), &peer(owner), dialect, &mut self.out);
     }
@@ -60,7 +61,7 @@ impl Agent {
         self.now = end;
     }
 
-    fn receive(&mut self, from: &str, dialect: Dialect, conversation: &str, act: Act) {
+    fn receive(&mut self, from: &str, dialect: LockDialect, conversation: &str, act: Act) {
         let message = LockMessage {
             conversation: Conversation::parse(conversation),
             dialect,
@@ -118,8 +119,8 @@ fn to(receiver: &str, conversation: &str, act: Act) -> (String, String, Act) {
     (receiver.to_owned(), conversation.to_owned(), act)
 }
 
-const LEGACY: Dialect = Dialect::Legacy;
-const OWN: Dialect = Dialect::Own;
+const LEGACY: LockDialect = LockDialect::Legacy;
+const OWN: LockDialect = LockDialect::Own;
 
 fn confirm(asked: Millis) -> Act {
     Act::Confirm { asked: Some(asked) }
@@ -137,7 +138,7 @@ fn fence_in(sent: &[(String, String, Act)]) -> Fence {
 #[test]
 fn an_early_confirm_waits_for_the_report_of_a_legacy_agent() {
     let members = [("agent2", LEGACY), ("agent3", OWN)];
-    let mut owner = Agent::owner("agent1", Kind::RicartAgrawala, &members);
+    let mut owner = Agent::owner("agent1", Algorithm::RicartAgrawala, &members);
     owner.receive("agent2", LEGACY, "agent2_1", Act::Request { clock: 1 });
     let agree = Act::Agree { clock: 1 };
     assert_eq!(owner.sent(), [to("agent2", "agent2_1", agree)]);
@@ -158,7 +159,7 @@ fn an_early_confirm_waits_for_the_report_of_a_legacy_agent() {
 #[test]
 fn the_owner_defers_its_agree_while_a_grant_is_live() {
     let members = [("agent2", OWN), ("agent3", LEGACY)];
-    let mut owner = Agent::owner("agent1", Kind::RicartAgrawala, &members);
+    let mut owner = Agent::owner("agent1", Algorithm::RicartAgrawala, &members);
     owner.receive("agent2", OWN, "agent2_1", confirm(1));
     owner.sent();
     owner.receive("agent3", LEGACY, "agent3_1", Act::Request { clock: 9 });
@@ -173,7 +174,7 @@ fn the_owner_defers_its_agree_while_a_grant_is_live() {
 fn an_expired_holder_keeps_legacy_agents_out_until_it_is_proved_gone() {
     let members = [("agent2", OWN), ("agent3", LEGACY), ("agent4", OWN)];
     for proof in ["release", "departure", "force"] {
-        let mut owner = Agent::owner("agent1", Kind::RicartAgrawala, &members);
+        let mut owner = Agent::owner("agent1", Algorithm::RicartAgrawala, &members);
         owner.receive("agent2", OWN, "agent2_1", confirm(1));
         let fence = fence_in(&owner.sent());
         owner.pass(15_000);
@@ -200,7 +201,7 @@ fn an_expired_holder_keeps_legacy_agents_out_until_it_is_proved_gone() {
 #[test]
 fn a_silent_legacy_holder_is_replaced_only_by_force() {
     let members = [("agent2", LEGACY), ("agent3", OWN)];
-    let mut owner = Agent::owner("agent1", Kind::RicartAgrawala, &members);
+    let mut owner = Agent::owner("agent1", Algorithm::RicartAgrawala, &members);
     owner.receive("agent2", LEGACY, "agent2_1", Act::Confirm { asked: None });
     owner.receive("agent3", OWN, "agent3_1", confirm(1));
     owner.events();
@@ -223,7 +224,7 @@ fn a_silent_legacy_holder_is_replaced_only_by_force() {
 #[test]
 fn a_legacy_agent_holds_the_resource_while_it_has_the_token() {
     let members = [("agent2", LEGACY), ("agent3", OWN)];
-    let mut owner = Agent::owner("agent1", Kind::SuzukiKasamiExtended, &members);
+    let mut owner = Agent::owner("agent1", Algorithm::SuzukiKasamiExtended, &members);
     owner.receive(
         "agent2",
         LEGACY,
@@ -261,7 +262,7 @@ fn a_legacy_agent_holds_the_resource_while_it_has_the_token() {
 
 #[test]
 fn a_lock_at_a_legacy_owner_has_no_fence() {
-    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    let mut agent = Agent::new("agent2", Algorithm::RicartAgrawala);
     agent.locks.join(0, &peer("agent1"), LEGACY, &mut agent.out);
     let claim = agent.lock(None);
     assert!(matches!(
@@ -285,7 +286,7 @@ fn a_lock_at_a_legacy_owner_has_no_fence() {
 #[test]
 fn a_late_owner_grants_no_withdrawn_request() {
     let members = [("agent2", OWN), ("agent3", OWN)];
-    let mut owner = Agent::owner("agent1", Kind::default(), &members);
+    let mut owner = Agent::owner("agent1", Algorithm::default(), &members);
     owner.receive("agent2", OWN, "agent2_0", confirm(1));
     owner.receive("agent3", OWN, "agent3_0", confirm(1));
     owner.sent();
@@ -310,7 +311,7 @@ fn a_late_owner_grants_no_withdrawn_request() {
 /// The member joins while the owner has not agreed.
 #[test]
 fn an_agent_that_joins_during_a_request_is_asked() {
-    for kind in [Kind::RicartAgrawala, Kind::RicartAgrawalaExtended] {
+    for kind in [Algorithm::RicartAgrawala, Algorithm::RicartAgrawalaExtended] {
         for dialect in [LEGACY, OWN] {
             let mut agent = Agent::new("agent2", kind);
             agent.owned_by("agent1", LEGACY);
@@ -333,7 +334,7 @@ fn an_agent_that_joins_during_a_request_is_asked() {
 /// and enters.
 #[test]
 fn a_legacy_agent_that_has_not_asked_is_asked_again_with_a_later_clock() {
-    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    let mut agent = Agent::new("agent2", Algorithm::RicartAgrawala);
     agent.owned_by("agent1", LEGACY);
     agent.locks.join(0, &peer("agent3"), LEGACY, &mut agent.out);
     agent.lock(None);
@@ -355,7 +356,7 @@ fn a_legacy_agent_that_has_not_asked_is_asked_again_with_a_later_clock() {
 /// The first request waits for the answers of the agents that were greeted, or for one second.
 #[test]
 fn the_first_request_waits_for_answers_to_greetings() {
-    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    let mut agent = Agent::new("agent2", Algorithm::RicartAgrawala);
     agent.locks.expect(0, &peer("agent3"));
     agent.locks.expect(0, &peer("agent4"));
     agent.owned_by("agent1", OWN);
@@ -379,7 +380,7 @@ fn the_first_request_waits_for_answers_to_greetings() {
     assert_eq!(receivers, ["agent1", "agent3"]);
 
     // All have answered or left. Then nothing waits for those that start later.
-    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    let mut agent = Agent::new("agent2", Algorithm::RicartAgrawala);
     agent.locks.expect(0, &peer("agent3"));
     agent.locks.expect(0, &peer("agent4"));
     agent.owned_by("agent1", OWN);
@@ -394,7 +395,7 @@ fn the_first_request_waits_for_answers_to_greetings() {
     assert_ne!(agent.locks.poll_timeout(), Some(1_000));
 
     // The round of `try_lock` begins after the wait.
-    let mut agent = Agent::new("agent2", Kind::RicartAgrawala);
+    let mut agent = Agent::new("agent2", Algorithm::RicartAgrawala);
     agent.locks.expect(0, &peer("agent4"));
     agent.owned_by("agent1", OWN);
     agent.locks.try_lock(0, &bay(), &mut agent.out);
@@ -408,7 +409,7 @@ fn the_first_request_waits_for_answers_to_greetings() {
 /// the owner, which then knows the conversation of the request before only.
 #[test]
 fn the_token_returns_to_a_legacy_owner_in_the_conversation_in_which_it_came() {
-    let mut agent = Agent::new("agent2", Kind::SuzukiKasamiExtended);
+    let mut agent = Agent::new("agent2", Algorithm::SuzukiKasamiExtended);
     agent.owned_by("agent1", LEGACY);
     let conversation = |agent: &mut Agent| {
         let sent = agent.sent();
@@ -433,7 +434,7 @@ fn the_token_returns_to_a_legacy_owner_in_the_conversation_in_which_it_came() {
 
 #[test]
 fn without_an_owner_a_claim_fails() {
-    let mut agent = Agent::new("agent2", Kind::default());
+    let mut agent = Agent::new("agent2", Algorithm::default());
     agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
     let claim = agent.lock(None);
     agent.pass(2_000);
@@ -453,7 +454,7 @@ fn without_an_owner_a_claim_fails() {
 
 #[test]
 fn a_claim_that_ends_before_an_owner_is_found_says_so() {
-    let mut agent = Agent::new("agent2", Kind::default());
+    let mut agent = Agent::new("agent2", Algorithm::default());
     let claim = agent.lock(Some(300));
     let second = agent.lock(Some(300));
     agent.pass(300);
@@ -469,7 +470,7 @@ fn a_claim_that_ends_before_an_owner_is_found_says_so() {
 
 #[test]
 fn a_withdrawn_request_is_answered_and_its_grant_released() {
-    let mut agent = Agent::new("agent2", Kind::RicartAgrawalaExtended);
+    let mut agent = Agent::new("agent2", Algorithm::RicartAgrawalaExtended);
     for name in ["agent1", "agent3"] {
         agent.locks.join(0, &peer(name), OWN, &mut agent.out);
     }
@@ -512,7 +513,7 @@ fn a_withdrawn_request_is_answered_and_its_grant_released() {
 
 #[test]
 fn try_lock_withdraws_after_one_round() {
-    let mut agent = Agent::new("agent2", Kind::RicartAgrawalaExtended);
+    let mut agent = Agent::new("agent2", Algorithm::RicartAgrawalaExtended);
     agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
     agent.owned_by("agent1", OWN);
     let first = agent.locks.try_lock(0, &bay(), &mut agent.out);
@@ -527,7 +528,7 @@ fn try_lock_withdraws_after_one_round() {
     assert_eq!(agent.events(), [failed(first, 1)]);
 
     // The owner of a live grant needs no round.
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         let mut owner = Agent::owner("agent1", kind, &[("agent2", OWN)]);
         owner.receive("agent2", OWN, "agent2_0", confirm(1));
         owner.sent();
@@ -544,7 +545,7 @@ fn try_lock_withdraws_after_one_round() {
 #[test]
 fn a_repeated_report_that_waits_is_answered_once() {
     let members = [("agent2", OWN), ("agent3", OWN)];
-    let mut owner = Agent::owner("agent1", Kind::default(), &members);
+    let mut owner = Agent::owner("agent1", Algorithm::default(), &members);
     owner.receive("agent2", OWN, "agent2_0", confirm(1));
     owner.receive("agent3", OWN, "agent3_0", confirm(1));
     owner.sent();
@@ -561,7 +562,7 @@ fn a_repeated_report_that_waits_is_answered_once() {
 #[test]
 fn a_lost_owner_makes_the_resource_unreachable() {
     for proved in [true, false] {
-        let mut agent = Agent::new("agent2", Kind::RicartAgrawalaExtended);
+        let mut agent = Agent::new("agent2", Algorithm::RicartAgrawalaExtended);
         agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
         agent.owned_by("agent1", OWN);
         let claim = agent.lock(None);
@@ -587,8 +588,8 @@ fn a_lost_owner_makes_the_resource_unreachable() {
 
 #[test]
 fn a_second_owner_is_refused_and_both_are_told() {
-    let mut first = Agent::owner("agent1", Kind::default(), &[("agent2", OWN)]);
-    let mut second = Agent::new("agent2", Kind::default());
+    let mut first = Agent::owner("agent1", Algorithm::default(), &[("agent2", OWN)]);
+    let mut second = Agent::new("agent2", Algorithm::default());
     second.locks.join(0, &peer("agent1"), OWN, &mut second.out);
     let state = OwnerState::first().next_life(1_000);
     second.locks.own(0, &bay(), &state, &mut second.out);
@@ -620,7 +621,7 @@ fn a_second_owner_is_refused_and_both_are_told() {
 /// Two networks join.
 #[test]
 fn two_established_owners_name_each_other() {
-    let mut first = Agent::owner("agent1", Kind::default(), &[]);
+    let mut first = Agent::owner("agent1", Algorithm::default(), &[]);
     assert_eq!(first.rival(), None);
     first.receive("agent2", OWN, "agent2_announce_0", Act::Owned);
     let contested = Event::Contested {
@@ -638,7 +639,7 @@ fn two_established_owners_name_each_other() {
 fn an_owner_is_silent_while_grants_of_its_life_before_may_be_live() {
     let before = OwnerState::first().next_life(15_000);
     let stored: OwnerState = before.to_string().parse().unwrap();
-    let mut owner = Agent::new("agent1", Kind::default());
+    let mut owner = Agent::new("agent1", Algorithm::default());
     owner.locks.join(0, &peer("agent2"), OWN, &mut owner.out);
     owner
         .locks
@@ -662,7 +663,7 @@ fn an_owner_is_silent_while_grants_of_its_life_before_may_be_live() {
 #[test]
 fn several_resources_are_held_all_or_none() {
     let names = ["c", "a", "b"].map(|name| Resource::new(name).unwrap());
-    let mut owner = Agent::new("agent1", Kind::RicartAgrawalaExtended);
+    let mut owner = Agent::new("agent1", Algorithm::RicartAgrawalaExtended);
     owner.locks.join(0, &peer("agent2"), OWN, &mut owner.out);
     for name in &names {
         let state = OwnerState::first().next_life(15_000);
@@ -732,7 +733,7 @@ fn several_resources_are_held_all_or_none() {
 #[test]
 fn a_dead_holder_is_replaced_at_once_and_its_late_command_refused() {
     let members = [("agent2", OWN), ("agent3", OWN)];
-    let mut owner = Agent::owner("agent1", Kind::RicartAgrawalaExtended, &members);
+    let mut owner = Agent::owner("agent1", Algorithm::RicartAgrawalaExtended, &members);
     owner.receive("agent2", OWN, "agent2_0", confirm(1));
     let first = fence_in(&owner.sent());
     owner.receive("agent3", OWN, "agent3_0", confirm(1));
@@ -762,7 +763,7 @@ fn a_dead_holder_is_replaced_at_once_and_its_late_command_refused() {
 
 #[test]
 fn requests_of_one_peer_take_a_bounded_amount_of_memory() {
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         let mut owner = Agent::owner("agent1", kind, &[("agent2", OWN)]);
         owner.receive("agent2", OWN, "agent2_0", confirm(1));
         for number in 1..=2_000_u64 {
@@ -782,7 +783,7 @@ fn requests_of_one_peer_take_a_bounded_amount_of_memory() {
 
 #[test]
 fn an_agent_that_owns_nothing_refuses_reports() {
-    let mut agent = Agent::new("agent1", Kind::default());
+    let mut agent = Agent::new("agent1", Algorithm::default());
     agent.receive("agent2", OWN, "agent2_0", confirm(3));
     let refused = Act::Refused {
         reason: Refusal::NotOwner,
@@ -800,7 +801,7 @@ fn an_agent_that_owns_nothing_refuses_reports() {
 /// A report can wait longer than the lease. The holder uses the grant only after it is confirmed.
 #[test]
 fn a_grant_that_waited_longer_than_its_lease_is_renewed_before_use() {
-    let mut agent = Agent::new("agent2", Kind::default());
+    let mut agent = Agent::new("agent2", Algorithm::default());
     agent.locks.join(0, &peer("agent1"), OWN, &mut agent.out);
     agent.owned_by("agent1", OWN);
     let claim = agent.lock(None);
@@ -831,10 +832,10 @@ fn a_grant_that_waited_longer_than_its_lease_is_renewed_before_use() {
 
 #[test]
 fn a_peer_with_many_requests_takes_bounded_memory() {
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         let names: Vec<String> = (0..50).map(|number| format!("member-{number}")).collect();
-        let members = names.iter().map(|name| (name.as_str(), Dialect::Own));
-        let members: Vec<_> = members.chain([("rover", Dialect::Own)]).collect();
+        let members = names.iter().map(|name| (name.as_str(), LockDialect::Own));
+        let members: Vec<_> = members.chain([("rover", LockDialect::Own)]).collect();
         let mut owner = Agent::owner("crane", kind, &members);
         let requests = 100_000_u64;
         for number in 0..requests {
@@ -855,7 +856,7 @@ fn a_peer_with_many_requests_takes_bounded_memory() {
             };
             let message = LockMessage {
                 conversation,
-                dialect: Dialect::Own,
+                dialect: LockDialect::Own,
                 algorithm: None,
                 content: Content::Lock { resource, act },
             };
@@ -879,7 +880,10 @@ fn a_peer_with_many_requests_takes_bounded_memory() {
 /// an error of the protocol.
 #[test]
 fn legacy_agents_get_neither_repetitions_nor_announcements() {
-    for kind in [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended] {
+    for kind in [
+        Algorithm::RicartAgrawalaExtended,
+        Algorithm::SuzukiKasamiExtended,
+    ] {
         let mut agent = Agent::new("agent2", kind);
         agent.locks.join(0, &peer("agent1"), LEGACY, &mut agent.out);
         agent.locks.join(0, &peer("agent3"), OWN, &mut agent.out);
@@ -894,7 +898,7 @@ fn legacy_agents_get_neither_repetitions_nor_announcements() {
         assert_eq!(repeated.len(), expected, "{repeated:?}");
         assert!(repeated.iter().all(|(receiver, ..)| receiver == "agent3"));
     }
-    let mut owner = Agent::owner("agent1", Kind::default(), &[]);
+    let mut owner = Agent::owner("agent1", Algorithm::default(), &[]);
     owner
         .locks
         .join(owner.now, &peer("agent2"), LEGACY, &mut owner.out);
@@ -918,7 +922,7 @@ impl Group {
     const NAMES: [&'static str; 4] = ["agent1", "agent2", "agent3", "agent4"];
 
     /// The first agent owns the bay.
-    fn new(kind: Kind) -> Self {
+    fn new(kind: Algorithm) -> Self {
         let mut agents: Vec<_> = Self::NAMES.map(|name| Agent::new(name, kind)).into();
         for (at, agent) in agents.iter_mut().enumerate() {
             for other in Self::NAMES.iter().enumerate().filter(|(it, _)| *it != at) {
@@ -1006,7 +1010,10 @@ fn a_lost_holder_or_waiter_delays_others_by_at_most_one_lease_and_one_probe_inte
     let options = Options::default();
     // Requests and reports after the end of the lease take some milliseconds.
     let bound = options.lease + options.probe_interval + 20;
-    for kind in [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended] {
+    for kind in [
+        Algorithm::RicartAgrawalaExtended,
+        Algorithm::SuzukiKasamiExtended,
+    ] {
         for phase in (0..options.lease).step_by(701) {
             for is_holder_lost in [true, false] {
                 let mut group = Group::new(kind);

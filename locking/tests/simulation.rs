@@ -10,7 +10,7 @@
 mod protocols;
 mod world;
 
-use fipa_locking::Kind;
+use fipa_locking::Algorithm;
 use world::{Setup, World};
 
 fn seeds(default: u64) -> std::ops::Range<u64> {
@@ -34,7 +34,7 @@ fn ran(setup: Setup, seed: u64) -> World {
     world
 }
 
-fn simulate(kind: Kind, faults: bool, seeds: std::ops::Range<u64>) -> u64 {
+fn simulate(kind: Algorithm, faults: bool, seeds: std::ops::Range<u64>) -> u64 {
     let mut acquired = 0;
     for seed in seeds {
         let setup = Setup {
@@ -54,23 +54,23 @@ fn simulate(kind: Kind, faults: bool, seeds: std::ops::Range<u64>) -> u64 {
 
 #[test]
 fn faults_break_no_invariant_of_the_owner_s_queue_and_every_claim_ends() {
-    assert!(simulate(Kind::OwnerQueue, true, seeds(60)) > 0);
+    assert!(simulate(Algorithm::OwnerQueue, true, seeds(60)) > 0);
 }
 
 #[test]
 fn faults_break_no_invariant_of_ricart_agrawala_and_every_claim_ends() {
-    assert!(simulate(Kind::RicartAgrawalaExtended, true, seeds(60)) > 0);
+    assert!(simulate(Algorithm::RicartAgrawalaExtended, true, seeds(60)) > 0);
 }
 
 #[test]
 fn faults_break_no_invariant_of_suzuki_kasami_and_every_claim_ends() {
-    assert!(simulate(Kind::SuzukiKasamiExtended, true, seeds(60)) > 0);
+    assert!(simulate(Algorithm::SuzukiKasamiExtended, true, seeds(60)) > 0);
 }
 
 /// Basic algorithms need reliable members and messages. Then each claim is acquired.
 #[test]
 fn without_faults_every_claim_is_acquired() {
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         let seeds = seeds(20);
         let mut expected = 0;
         for seed in seeds.clone() {
@@ -84,7 +84,7 @@ fn without_faults_every_claim_is_acquired() {
 /// pause.
 #[test]
 fn the_messages_fit_the_protocols_that_agents_enforce() {
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         for seed in seeds(15) {
             let setup = Setup {
                 kind,
@@ -105,7 +105,7 @@ fn the_messages_fit_the_protocols_that_agents_enforce() {
 /// it. With a token, the agent that has entered or is about to receive the token can enter once more.
 #[test]
 fn each_agent_overtakes_a_request_a_bounded_number_of_times() {
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         let bound = if kind.has_token() { 2 } else { 1 };
         let mut highest = 0;
         for seed in seeds(40) {
@@ -130,7 +130,10 @@ fn each_agent_overtakes_a_request_a_bounded_number_of_times() {
 /// last kill on.
 #[test]
 fn each_agent_overtakes_a_request_of_an_agent_that_was_killed_a_bounded_number_of_times() {
-    for kind in [Kind::RicartAgrawalaExtended, Kind::SuzukiKasamiExtended] {
+    for kind in [
+        Algorithm::RicartAgrawalaExtended,
+        Algorithm::SuzukiKasamiExtended,
+    ] {
         let mut highest = 0;
         for seed in seeds(60) {
             let setup = Setup {
@@ -155,7 +158,7 @@ fn each_agent_overtakes_a_request_of_an_agent_that_was_killed_a_bounded_number_o
 #[test]
 fn the_number_of_messages_is_the_minimum() {
     for agents in [2_usize, 3, 5, 8] {
-        for kind in Kind::ALL {
+        for kind in Algorithm::ALL {
             let setup = Setup {
                 kind,
                 agents,
@@ -170,11 +173,11 @@ fn the_number_of_messages_is_the_minimum() {
             let again = world.messages_of_one_acquisition(1);
             let n = agents as u64;
             match kind {
-                Kind::OwnerQueue => {
+                Algorithm::OwnerQueue => {
                     assert_eq!((first, again), (3, 3), "{kind}, {n}");
                     assert_eq!(world.messages_of_one_acquisition(0), 0, "{kind}, {n}");
                 }
-                Kind::RicartAgrawala | Kind::RicartAgrawalaExtended => {
+                Algorithm::RicartAgrawala | Algorithm::RicartAgrawalaExtended => {
                     assert_eq!(
                         (first, again),
                         (2 * (n - 1) + 3, 2 * (n - 1) + 3),
@@ -182,9 +185,9 @@ fn the_number_of_messages_is_the_minimum() {
                     );
                 }
                 // The token stays with its last holder.
-                Kind::SuzukiKasami => assert_eq!((first, again), (n + 3, 3), "{kind}, {n}"),
+                Algorithm::SuzukiKasami => assert_eq!((first, again), (n + 3, 3), "{kind}, {n}"),
                 // The token's return is the report to the owner.
-                Kind::SuzukiKasamiExtended => {
+                Algorithm::SuzukiKasamiExtended => {
                     assert_eq!((first, again), (n + 3, n + 3), "{kind}, {n}");
                     // Agent 0 is the owner and has the token.
                     assert_eq!(world.messages_of_one_acquisition(0), 0, "{kind}, {n}");

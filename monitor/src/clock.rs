@@ -5,10 +5,10 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 /// The current time on two clocks.
 ///
 /// `reply-by` is a time of the wall clock. The age of a conversation and the timeouts of a protocol are
-/// spans of a clock that nothing sets back. A [`SystemTime`] converts into a `Now` with the wall clock
+/// spans of a clock that nothing sets back. A [`SystemTime`] converts into a `Moment` with the wall clock
 /// for both.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Now {
+pub struct Moment {
     /// Time of the wall clock.
     pub wall: SystemTime,
     /// Time since a fixed point, on a monotonic clock that counts while the machine is suspended, such
@@ -16,7 +16,7 @@ pub struct Now {
     pub elapsed: Duration,
 }
 
-impl Now {
+impl Moment {
     /// Creates the current time from a time of the wall clock and one of a monotonic clock.
     #[must_use]
     pub fn new(wall: SystemTime, elapsed: Duration) -> Self {
@@ -46,7 +46,7 @@ impl Now {
     }
 }
 
-impl From<SystemTime> for Now {
+impl From<SystemTime> for Moment {
     fn from(wall: SystemTime) -> Self {
         let elapsed = wall.duration_since(UNIX_EPOCH).unwrap_or_default();
         Self { wall, elapsed }
@@ -66,7 +66,7 @@ mod tests {
     #[test]
     fn times_of_the_wall_clock_are_times_of_the_monotonic_clock() {
         let wall = UNIX_EPOCH + Duration::from_secs(1_000);
-        let now = Now::new(wall, Duration::from_secs(50));
+        let now = Moment::new(wall, Duration::from_secs(50));
         assert_eq!(now.millis(), 50_000);
         assert_eq!(now.millis_at(wall + Duration::from_secs(3)), 53_000);
         assert_eq!(now.millis_at(wall - Duration::from_secs(3)), 47_000);
@@ -74,6 +74,6 @@ mod tests {
         let at = |secs| now.wall_at(Duration::from_secs(secs));
         assert_eq!(at(60), Some(wall + Duration::from_secs(10)));
         assert_eq!(at(40), Some(wall - Duration::from_secs(10)));
-        assert_eq!(Now::from(wall).millis(), 1_000_000);
+        assert_eq!(Moment::from(wall).millis(), 1_000_000);
     }
 }

@@ -22,7 +22,7 @@ use crate::machine::{Cancel, Machine, Scope, step};
 use crate::monitor::{Denied, Monitor};
 use crate::names::Names;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
-use crate::{Header, Now};
+use crate::{Header, Moment};
 
 impl Monitor {
     /// Whether the conversation began between other agents.
@@ -50,7 +50,7 @@ impl Monitor {
         parent: u32,
         machine: u16,
         (header, observed): (&Header<'_>, &ObservedMessage<'_>),
-        now: Now,
+        now: Moment,
     ) -> Result<(), Denied> {
         let library = Arc::clone(&self.library);
         let protocol = library.machine(machine);
@@ -74,7 +74,7 @@ impl Monitor {
         at: u32,
         observed: &ObservedMessage<'_>,
         denied: Denied,
-        now: Now,
+        now: Moment,
     ) -> Denied {
         let library = Arc::clone(&self.library);
         let slot = self
@@ -124,7 +124,7 @@ impl Monitor {
         at: u32,
         machine: &Machine,
         observed: &ObservedMessage<'_>,
-        now: Now,
+        now: Moment,
     ) {
         let Some(slot) = self.table.slot_mut(at) else {
             return;

@@ -9,7 +9,7 @@
 //!   content.
 //!
 //! The crate has no input or output, no clocks and no threads: the caller passes messages and the
-//! current time ([`Now`]), and gets verdicts.
+//! current time ([`Moment`]), and gets verdicts.
 //!
 //! A message that continues a conversation of which the monitor does not know the beginning is
 //! *unchecked*, and no violation. [`History`] tells the monitor how much it knows, and [`Policy`]
@@ -45,7 +45,7 @@ mod table;
 mod verdict;
 
 pub use act::near_standard;
-pub use clock::Now;
+pub use clock::Moment;
 pub use header::Header;
 pub use library::{Library, LibraryError, LibraryFull};
 pub use limits::Limits;

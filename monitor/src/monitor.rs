@@ -25,7 +25,7 @@ use crate::report::violation;
 use crate::roles::take_back_local;
 use crate::table::{List, Slot, Table};
 use crate::verdict::{Accepted, Unchecked, Verdict, ViolationKind as Kind};
-use crate::{Header, History, Library, Limits, Now, Policy};
+use crate::{Header, History, Library, Limits, Moment, Policy};
 
 /// Checks messages against the protocols of their conversations.
 ///
@@ -56,7 +56,7 @@ pub struct Monitor {
     /// Buffer that is reused.
     moves: Vec<Move>,
     forgotten: u64,
-    pub(crate) last: Now,
+    pub(crate) last: Moment,
 }
 
 /// An event that has no message.
@@ -142,7 +142,7 @@ impl Monitor {
             single: false,
             moves: Vec::new(),
             forgotten: 0,
-            last: Now::from(UNIX_EPOCH),
+            last: Moment::from(UNIX_EPOCH),
         }
     }
 
@@ -221,7 +221,7 @@ impl Monitor {
     }
 
     /// Checks a message. If it fits its conversation, updates the conversation.
-    pub fn check(&mut self, header: &Header<'_>, now: impl Into<Now>) -> Verdict<'_> {
+    pub fn check(&mut self, header: &Header<'_>, now: impl Into<Moment>) -> Verdict<'_> {
         let now = now.into();
         self.last = now;
         match self.take(header, now) {
@@ -266,7 +266,7 @@ impl Monitor {
 
     /// Reports that a message, which was accepted, was not delivered to a receiver, or that this is
     /// uncertain. If it is the last message of its conversation, it may be sent again.
-    pub fn undelivered(&mut self, header: &Header<'_>, receiver: &str, now: impl Into<Now>) {
+    pub fn undelivered(&mut self, header: &Header<'_>, receiver: &str, now: impl Into<Moment>) {
         let now = now.into();
         self.last = now;
         let (Some(id), Some(sender)) = (header.conversation(), header.sender_name()) else {
@@ -352,7 +352,7 @@ impl Monitor {
         })
     }
 
-    fn take(&mut self, header: &Header<'_>, now: Now) -> Result<Passed, Denied> {
+    fn take(&mut self, header: &Header<'_>, now: Moment) -> Result<Passed, Denied> {
         let unchecked = |why| Err(Denied::Unchecked(why));
         let Some(id) = header.conversation() else {
             return Err(self.without_conversation(header));
@@ -679,7 +679,7 @@ impl Monitor {
         at: u32,
         observed: &ObservedMessage<'_>,
         denied: Denied,
-        now: Now,
+        now: Moment,
     ) -> Denied {
         if observed.undelivered_to.is_some() {
             return denied;
@@ -711,7 +711,7 @@ impl Monitor {
         main: u32,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
-        now: Now,
+        now: Moment,
     ) -> Result<Passed, Denied> {
         let name = header.protocol_name().unwrap_or_default();
         let (mut denied, mut open) = (None, None);
@@ -824,7 +824,7 @@ impl Monitor {
         machine: u16,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
-        now: Now,
+        now: Moment,
     ) -> Result<Passed, Denied> {
         let library = Arc::clone(&self.library);
         let Some(protocol) = library.machine(machine) else {
@@ -877,7 +877,7 @@ impl Monitor {
         parent: u32,
         machine: u16,
         (header, observed): (&Header<'_>, &ObservedMessage<'_>),
-        now: Now,
+        now: Moment,
     ) -> Result<u32, Denied> {
         if parent == NONE {
             self.evict_alike(id)?;
@@ -911,7 +911,7 @@ impl Monitor {
         protocol: &Machine,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
-        now: Now,
+        now: Moment,
     ) -> Denied {
         if !protocol.may_follow(observed.act) {
             return Denied::NotOpened(machine);
@@ -1009,7 +1009,7 @@ impl Monitor {
         at: u32,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
-        now: Now,
+        now: Moment,
     ) -> Result<Passed, Denied> {
         let now_ms = now.millis();
         let fault = |kind| Denied::Fault(Fault::plain(kind), at);
@@ -1188,7 +1188,7 @@ impl Monitor {
     }
 
     /// Time at which the caller must call [`handle_timeout`](Self::handle_timeout) next, on the
-    /// monotonic clock: see [`Now::elapsed`].
+    /// monotonic clock: see [`Moment::elapsed`].
     #[must_use]
     pub fn poll_elapsed(&self) -> Option<Duration> {
         let kept = |list, span: Duration| {
@@ -1208,7 +1208,7 @@ impl Monitor {
 
     /// Handles timeouts: reports overdue messages, and removes conversations that are over or
     /// abandoned.
-    pub fn handle_timeout(&mut self, now: impl Into<Now>) -> Vec<Event> {
+    pub fn handle_timeout(&mut self, now: impl Into<Moment>) -> Vec<Event> {
         self.last = now.into();
         let now = self.last.millis();
         let mut events = Vec::new();

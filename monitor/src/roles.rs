@@ -13,7 +13,7 @@ use crate::monitor::{Denied, Monitor, Passed};
 use crate::names::Names;
 use crate::projection::{LocalRun, NotLocal, Observed, Projection};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
-use crate::{Header, Now};
+use crate::{Header, Moment};
 
 impl Monitor {
     /// Begins a conversation with the first message that the agent sends or receives in it.
@@ -23,7 +23,7 @@ impl Monitor {
         (index, machine): (u16, &Machine),
         projection: &Projection,
         (header, observed): (&Header<'_>, &ObservedMessage<'_>),
-        now: Now,
+        now: Moment,
     ) -> Result<Passed, Denied> {
         if begun(projection, observed).is_none() {
             let certain = observed.own && self.is_certain(id);
@@ -124,7 +124,7 @@ impl Monitor {
         at: u32,
         projection: &Projection,
         observed: &ObservedMessage<'_>,
-        now: Now,
+        now: Moment,
     ) -> Result<Passed, Denied> {
         if observed.undelivered_to.is_some() {
             return Err(Denied::Unchecked(Unchecked::BegunElsewhere));

@@ -36,7 +36,7 @@ use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::machine::{Machine, Scope};
 use crate::monitor::Monitor;
 use crate::names::{Name, Names};
-use crate::{Library, Limits, Now};
+use crate::{Library, Limits, Moment};
 
 const MAGIC: [u8; 8] = *b"fipa-cnv";
 const VERSION: u32 = 1;
@@ -86,7 +86,7 @@ impl Monitor {
     /// protocols with three or more roles. It has at most [`Limits::bytes`] bytes, and keeps the latest
     /// conversations. The next monitor does not know the others.
     #[must_use]
-    pub fn snapshot(&self, now: impl Into<Now>) -> Vec<u8> {
+    pub fn snapshot(&self, now: impl Into<Moment>) -> Vec<u8> {
         let now = now.into();
         let agent = self.agent.as_deref().unwrap_or_default();
         let mut out = Vec::new();
@@ -130,7 +130,7 @@ impl Monitor {
     }
 
     /// Writes a main conversation with its embedded ones. `None` if one of them is uncertain.
-    fn write_main(&self, main: u32, agent: &str, now: Now, out: &mut Vec<u8>) -> Option<()> {
+    fn write_main(&self, main: u32, agent: &str, now: Moment, out: &mut Vec<u8>) -> Option<()> {
         self.write_part(main, agent, now, out)?;
         let count_at = out.len();
         put_count(out, 0);
@@ -145,7 +145,7 @@ impl Monitor {
         Some(())
     }
 
-    fn write_part(&self, at: u32, agent: &str, now: Now, out: &mut Vec<u8>) -> Option<()> {
+    fn write_part(&self, at: u32, agent: &str, now: Moment, out: &mut Vec<u8>) -> Option<()> {
         let conversation = &self.table.slot(at)?.conversation;
         let names = &self.names;
         let machine = self.library.machine(conversation.machine)?;
@@ -200,7 +200,7 @@ impl Monitor {
     pub fn restore(
         &mut self,
         snapshot: &[u8],
-        now: impl Into<Now>,
+        now: impl Into<Moment>,
     ) -> Result<usize, SnapshotError> {
         let now = now.into();
         let Some(agent) = self.agent.clone().filter(|_| self.is_empty()) else {
@@ -222,7 +222,7 @@ impl Monitor {
         Ok(self.len())
     }
 
-    fn put(&mut self, part: &Part<'_>, parent: u32, now: Now) -> u32 {
+    fn put(&mut self, part: &Part<'_>, parent: u32, now: Moment) -> u32 {
         let peer = match part.peer {
             "" => NONE,
             peer => self.names.acquire(peer),
@@ -309,7 +309,7 @@ fn write_party(
     machine: &Machine,
     names: &Names,
     party: &Party,
-    now: Now,
+    now: Moment,
     out: &mut Vec<u8>,
 ) -> Option<()> {
     // Only such a party has [`Worlds`](crate::conversation::Worlds).
@@ -372,7 +372,7 @@ struct Context<'a> {
     library: &'a Library,
     limits: &'a Limits,
     agent: &'a str,
-    now: Now,
+    now: Moment,
 }
 
 impl<'s> Read<'s> {
@@ -381,7 +381,7 @@ impl<'s> Read<'s> {
         library: &Library,
         limits: &Limits,
         agent: &str,
-        now: Now,
+        now: Moment,
     ) -> Result<Self, SnapshotError> {
         if snapshot.len() > limits.bytes {
             return Err(SnapshotError::TooLarge("length of the snapshot"));
@@ -595,7 +595,7 @@ impl<'s> Input<'s> {
     fn party(
         &mut self,
         machine: Option<&Machine>,
-        now: Now,
+        now: Moment,
     ) -> Result<(&'s str, Party), SnapshotError> {
         let malformed = |what| Err(SnapshotError::Malformed(what));
         let peer = self.text()?;

@@ -11,7 +11,7 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
 use fipa_transport::{
-    Answer, Arrival, Conclusion, Hop, Incarnation, Kind, Parcel, Principal, Verdict,
+    Answer, Arrival, Conclusion, Hop, Incarnation, Kind, Parcel, Principal, Reaction,
 };
 
 const ROVER: Incarnation = Incarnation::from_u64(0xb);
@@ -122,7 +122,7 @@ impl Gateway {
         };
         let now = self.at(ms);
         let verdict = self.core.handle_arrival(now, Kind::Shm, arrival);
-        assert_eq!(verdict, Verdict::Now(Answer::Custody));
+        assert_eq!(verdict, Reaction::Now(Answer::Custody));
     }
 
     /// The time at which the letter is dispatched, by the timers of the core alone.

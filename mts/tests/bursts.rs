@@ -17,7 +17,7 @@ use fipa_mts::{AccessGate, LetterParts, Link, letter_for};
 use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Reach, Registration, View};
 use fipa_transport::{
     Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location, Outcome,
-    Parcel, Principal, Ticket, TransportError, TransportErrorKind, Verdict,
+    Parcel, Principal, Reaction, Ticket, TransportError, TransportErrorKind,
 };
 
 /// The services in the order of a letter's path.
@@ -356,10 +356,10 @@ impl Path {
         };
         let now = self.clocks();
         match self.services[to].core.handle_arrival(now, kind, arrival) {
-            Verdict::Now(answer) => {
+            Reaction::Now(answer) => {
                 self.conclude((to, from), attempt, Conclusion::Answered(answer))
             }
-            Verdict::Later => {
+            Reaction::Later => {
                 self.services[to].tickets.insert(ticket, (from, attempt));
             }
         }

@@ -12,7 +12,7 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Reach, Registration, View};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Principal, Report, Stream, TransportError, TransportErrorKind, Verdict,
+    Outcome, Parcel, Principal, Reaction, Report, Stream, TransportError, TransportErrorKind,
 };
 
 use self::common::letter;
@@ -92,18 +92,18 @@ impl Service {
     }
 
     /// A letter arrives for `arm`, in this transfer of the previous service.
-    fn arrive(&mut self, ms: u64, sequence: u64, transfer: u64) -> Verdict {
+    fn arrive(&mut self, ms: u64, sequence: u64, transfer: u64) -> Reaction {
         self.receive(ms, Kind::Shm, {
             let body = Body::Letter(letter());
             parcel(sequence, transfer, body)
         })
     }
 
-    fn receive(&mut self, ms: u64, via: Kind, parcel: Parcel) -> Verdict {
+    fn receive(&mut self, ms: u64, via: Kind, parcel: Parcel) -> Reaction {
         self.receive_from(ms, via, shm(OWN), parcel)
     }
 
-    fn receive_from(&mut self, ms: u64, via: Kind, location: Location, parcel: Parcel) -> Verdict {
+    fn receive_from(&mut self, ms: u64, via: Kind, location: Location, parcel: Parcel) -> Reaction {
         let from = Hop {
             location,
             principal: Principal::Host,
@@ -358,12 +358,12 @@ fn a_gateway_answers_which_letters_it_has() {
         |gateway: &mut Service, ms, sequence, transfer| match gateway.receive(ms, Kind::Shm, {
             parcel(sequence, transfer, Body::Predecessor)
         }) {
-            Verdict::Now(answer) => answer,
-            Verdict::Later => panic!("notes are answered at once"),
+            Reaction::Now(answer) => answer,
+            Reaction::Later => panic!("notes are answered at once"),
         };
     let without = Answer::Returned { uncertain: true };
     assert_eq!(asked(&mut gateway, 0, 5, 70), without);
-    assert_eq!(gateway.arrive(0, 5, 70), Verdict::Now(Answer::Custody));
+    assert_eq!(gateway.arrive(0, 5, 70), Reaction::Now(Answer::Custody));
     let (attempt, _) = gateway.dispatched().unwrap();
     assert_eq!(asked(&mut gateway, 1, 5, 70), Answer::Accepted);
     assert_eq!(asked(&mut gateway, 1, 6, 71), without);
@@ -387,14 +387,14 @@ fn a_gateway_answers_that_the_receivers_queue_is_full() {
     let asked = |gateway: &mut Service, ms| {
         gateway.receive(ms, Kind::Shm, parcel(5, 70, Body::Predecessor))
     };
-    assert_eq!(asked(&mut gateway, 2), Verdict::Now(Answer::Busy));
+    assert_eq!(asked(&mut gateway, 2), Reaction::Now(Answer::Busy));
     gateway.arrive(3, 6, 71);
     let (ms, attempt, _) = gateway.wait_for_dispatch(3, 1000).unwrap();
     gateway.answer(ms, attempt, Answer::Accepted);
     // The queue has room again, and letter 6 has no answer yet.
     let question = parcel(6, 71, Body::Predecessor);
     let answer = gateway.receive(ms, Kind::Shm, question);
-    assert_eq!(answer, Verdict::Now(Answer::Accepted));
+    assert_eq!(answer, Reaction::Now(Answer::Accepted));
 }
 
 /// The receiver is asked behind a custodian that answers like this. Returns the reason for a letter that
@@ -566,7 +566,7 @@ fn a_report_that_is_refused_hides_no_lost_letter() {
         Answer::failed(FailureReason::Refused, "impostor"),
     );
     let asked = gateway.receive(3, Kind::Shm, parcel(5, 70, Body::Predecessor));
-    assert_eq!(asked, Verdict::Now(Answer::Returned { uncertain: true }));
+    assert_eq!(asked, Reaction::Now(Answer::Returned { uncertain: true }));
 }
 
 #[test]
@@ -700,7 +700,7 @@ fn a_gateway_that_ends_returns_the_letters_in_its_custody() {
     gateway.answer(ms, again, Answer::Accepted);
     assert!(!gateway.core.has_open_reports());
     // Further letters stay with the services before it.
-    assert_eq!(gateway.arrive(ms, 9, 74), Verdict::Now(Answer::Busy));
+    assert_eq!(gateway.arrive(ms, 9, 74), Reaction::Now(Answer::Busy));
 }
 
 /// With a round over the routes of its own, each letter would wait for the end of the one before it.

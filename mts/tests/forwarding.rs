@@ -14,7 +14,8 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, Unframed};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
-    LegacySource, Location, Outcome, Parcel, Principal, Report, Signature, Stream, Ticket, Verdict,
+    LegacySource, Location, Outcome, Parcel, Principal, Reaction, Report, Signature, Stream,
+    Ticket,
 };
 
 use self::common::letter;
@@ -68,7 +69,7 @@ impl Gateway {
         }
     }
 
-    fn arrive(&mut self, ms: u64, via: Kind, parcel: Parcel) -> Verdict {
+    fn arrive(&mut self, ms: u64, via: Kind, parcel: Parcel) -> Reaction {
         let from = Hop {
             location: tcp(0x1),
             principal: match via {
@@ -174,7 +175,7 @@ fn the_answer_to_a_peer_waits_for_the_outcome() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
         gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
-        Verdict::Later
+        Reaction::Later
     );
     let (attempt, location, passed_on) = gateway.dispatched();
     assert_eq!(location, shm(0x9));
@@ -194,7 +195,7 @@ fn the_answer_to_a_process_of_the_host_names_the_transport() {
     let mut gateway = Gateway::new(true);
     gateway.late = true;
     let verdict = gateway.arrive(0, Kind::Shm, parcel(1, letter()));
-    assert_eq!(verdict, Verdict::Later);
+    assert_eq!(verdict, Reaction::Later);
     let (attempt, ..) = gateway.dispatched();
     gateway.nothing_to_do();
     gateway.conclude(1, attempt, Answer::Accepted);
@@ -214,7 +215,7 @@ fn a_slow_receiver_causes_custody_and_a_report() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
         gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
-        Verdict::Later
+        Reaction::Later
     );
     let (attempt, ..) = gateway.dispatched();
     gateway.conclude(1, attempt, Answer::Busy);
@@ -235,7 +236,7 @@ fn a_slow_receiver_causes_custody_and_a_report() {
 fn an_arrival_without_a_ticket_is_answered_at_once_with_custody() {
     let mut gateway = Gateway::new(true);
     let verdict = gateway.arrive(0, Kind::Shm, parcel(1, letter()));
-    assert_eq!(verdict, Verdict::Now(Answer::Custody));
+    assert_eq!(verdict, Reaction::Now(Answer::Custody));
     let (attempt, ..) = gateway.dispatched();
     gateway.conclude(1, attempt, Answer::failed(FailureReason::Refused, "no"));
     let (attempt, _, report) = gateway.dispatched();
@@ -266,12 +267,12 @@ fn a_copy_of_a_letter_in_custody_is_not_a_second_letter() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
         gateway.arrive(0, Kind::Shm, parcel(1, letter())),
-        Verdict::Now(Answer::Custody)
+        Reaction::Now(Answer::Custody)
     );
     let (attempt, ..) = gateway.dispatched();
     assert_eq!(
         gateway.arrive(1, Kind::Shm, parcel(1, letter())),
-        Verdict::Now(Answer::Custody)
+        Reaction::Now(Answer::Custody)
     );
     gateway.nothing_to_do();
     gateway.conclude(2, attempt, Answer::Accepted);
@@ -284,7 +285,7 @@ fn a_forwarded_letter_is_stamped_and_a_returning_one_is_a_loop() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
         gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
-        Verdict::Later
+        Reaction::Later
     );
     let (_, _, passed_on) = gateway.dispatched();
     let Body::Letter(stamped) = passed_on.body else {
@@ -293,7 +294,7 @@ fn a_forwarded_letter_is_stamped_and_a_returning_one_is_a_loop() {
     assert!(stamped.envelope_len() > letter().envelope_len());
     assert_eq!(stamped.payload(), letter().payload());
     match gateway.arrive(1, Kind::Tcp, parcel(2, stamped.clone())) {
-        Verdict::Now(Answer::Failed {
+        Reaction::Now(Answer::Failed {
             reason: FailureReason::Loop,
             ..
         }) => {}
@@ -313,7 +314,7 @@ fn a_forwarded_letter_is_stamped_and_a_returning_one_is_a_loop() {
     namesake.core = Core::new(config, Arc::new(directory));
     assert_eq!(
         namesake.arrive(1, Kind::Tcp, parcel(2, stamped)),
-        Verdict::Later
+        Reaction::Later
     );
 }
 
@@ -322,7 +323,7 @@ fn a_malformed_envelope_is_refused() {
     let mut gateway = Gateway::new(true);
     let nonsense = Letter::new(bytes::Bytes::from_static(b"\xfe\x00"), bytes::Bytes::new());
     match gateway.arrive(0, Kind::Tcp, parcel(1, nonsense)) {
-        Verdict::Now(Answer::Failed {
+        Reaction::Now(Answer::Failed {
             reason: FailureReason::Refused,
             detail,
         }) => {
@@ -337,7 +338,7 @@ fn a_malformed_envelope_is_refused() {
 fn a_robot_process_forwards_nothing() {
     let mut process = Gateway::new(false);
     match process.arrive(0, Kind::Tcp, parcel(1, letter())) {
-        Verdict::Now(Answer::Failed {
+        Reaction::Now(Answer::Failed {
             reason: FailureReason::NoSuchAgent,
             ..
         }) => {}
@@ -352,12 +353,12 @@ fn a_lane_that_is_full_holds_back_and_gives_credit() {
     for sequence in 1..=bound {
         assert_eq!(
             gateway.arrive(0, Kind::Shm, parcel(sequence, letter())),
-            Verdict::Now(Answer::Custody)
+            Reaction::Now(Answer::Custody)
         );
     }
     assert_eq!(
         gateway.arrive(0, Kind::Shm, parcel(bound + 1, letter())),
-        Verdict::Now(Answer::Busy)
+        Reaction::Now(Answer::Busy)
     );
     let mut credits = 0;
     let mut delivered = 0;
@@ -464,7 +465,7 @@ fn an_unknown_sender_becomes_a_contact() {
     let mut gateway = Gateway::new(true);
     assert_eq!(
         gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
-        Verdict::Later
+        Reaction::Later
     );
     match gateway.poll_action() {
         Some(Action::Heard {
@@ -500,10 +501,10 @@ fn a_letter_whose_predecessor_is_not_below_it_is_refused() {
         };
         let verdict = gateway.arrive(0, Kind::Tcp, parcel);
         if after < sequence {
-            assert_eq!(verdict, Verdict::Later);
+            assert_eq!(verdict, Reaction::Later);
             continue;
         }
-        let Verdict::Now(Answer::Failed { reason, .. }) = verdict else {
+        let Reaction::Now(Answer::Failed { reason, .. }) = verdict else {
             panic!("{sequence} after {after}: {verdict:?}");
         };
         assert_eq!(reason, FailureReason::Refused);
@@ -523,7 +524,7 @@ fn a_custodian_never_lowers_a_predecessor_by_itself() {
         after: 7,
         ..parcel(8, letter())
     };
-    assert_eq!(gateway.arrive(2600, Kind::Tcp, next), Verdict::Later);
+    assert_eq!(gateway.arrive(2600, Kind::Tcp, next), Reaction::Later);
     let passed_on = std::iter::from_fn(|| gateway.next()).find_map(|action| match action {
         Action::Dispatch { parcel, .. } => {
             Some(parcel).filter(|it| matches!(it.body, Body::Letter(_)))
@@ -542,7 +543,7 @@ fn a_letter_without_its_predecessor_is_returned() {
         after: 7,
         ..parcel(8, letter())
     };
-    assert_eq!(gateway.arrive(0, Kind::Tcp, orphan), Verdict::Later);
+    assert_eq!(gateway.arrive(0, Kind::Tcp, orphan), Reaction::Later);
     let (attempt, ..) = gateway.dispatched();
     gateway.conclude(1, attempt, Answer::OutOfOrder { last: 3 });
     gateway.nothing_to_do();
@@ -618,7 +619,7 @@ fn a_note_lowers_the_predecessor_of_a_held_letter() {
     };
     assert_eq!(
         gateway.arrive(2, Kind::Tcp, note),
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     );
     let (_, _, again) = gateway.dispatched();
     assert_eq!((again.sequence, again.after), (8, 3));

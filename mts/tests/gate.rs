@@ -11,7 +11,7 @@ use fipa_mts::{AccessGate, LetterParts, Link, Source, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal,
-    Stream, Verdict,
+    Reaction, Stream,
 };
 use parking_lot::Mutex;
 
@@ -79,8 +79,8 @@ fn arrival(to: Incarnation, called: &str, sequence: u64) -> Arrival {
     }
 }
 
-fn refused() -> Verdict {
-    Verdict::Now(Answer::failed(FailureReason::Refused, "hands off"))
+fn refused() -> Reaction {
+    Reaction::Now(Answer::failed(FailureReason::Refused, "hands off"))
 }
 
 fn config(forwards: bool) -> CoreConfig {
@@ -100,11 +100,11 @@ fn the_gate_is_called_once_per_letter_and_only_when_there_is_room() {
     core.register("brake".into(), BRAKE);
     let mut arrive =
         |to, called, sequence| core.handle_arrival(now(), Kind::Shm, arrival(to, called, sequence));
-    let accepted = Verdict::Now(Answer::Accepted);
+    let accepted = Reaction::Now(Answer::Accepted);
     assert_eq!(arrive(ARM, "arm", 1), accepted);
     assert_eq!(arrive(ARM, "arm", 1), accepted, "a copy");
     assert_eq!(arrive(ARM, "arm", 2), accepted);
-    assert_eq!(arrive(ARM, "arm", 3), Verdict::Now(Answer::Busy));
+    assert_eq!(arrive(ARM, "arm", 3), Reaction::Now(Answer::Busy));
     assert_eq!(*gate.0.lock(), ["arm", "arm"]);
     // The registration is that of `brake`; the name in the parcel does not matter.
     assert_eq!(arrive(BRAKE, "arm", 1), refused());
@@ -126,14 +126,14 @@ fn a_gateway_calls_the_gate_with_the_registered_name() {
     assert_eq!(verdict, refused());
     // No agent has this registration and this name.
     let verdict = core.handle_arrival(now(), Kind::Shm, arrival(BRAKE, "arm", 1));
-    let Verdict::Now(Answer::Failed { reason, .. }) = verdict else {
+    let Reaction::Now(Answer::Failed { reason, .. }) = verdict else {
         panic!("{verdict:?}");
     };
     assert_eq!(reason, FailureReason::NoSuchAgent);
     assert!(core.poll_action().is_none(), "the refusal caused no action");
     for _ in 0..2 {
         let verdict = core.handle_arrival(now(), Kind::Shm, arrival(ARM, "arm", 1));
-        assert_eq!(verdict, Verdict::Now(Answer::Custody));
+        assert_eq!(verdict, Reaction::Now(Answer::Custody));
     }
     assert_eq!(
         *gate.0.lock(),

@@ -17,8 +17,8 @@ use fipa_sds::{
 };
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
-    LegacySource, Location, Outcome, Parcel, Principal, Signature, TransportError,
-    TransportErrorKind, Verdict,
+    LegacySource, Location, Outcome, Parcel, Principal, Reaction, Signature, TransportError,
+    TransportErrorKind,
 };
 
 /// A recorded letter from a fipa_services agent, `cpp-sender`, to an agent `echo`.
@@ -668,7 +668,7 @@ fn a_letter_to_a_legacy_peers_agent_is_sent_not_delivered() {
         ticket: None,
     };
     let verdict = gateway.handle_arrival(now(), Kind::Shm, arrival);
-    assert_eq!(verdict, Verdict::Now(Answer::Custody));
+    assert_eq!(verdict, Reaction::Now(Answer::Custody));
     process.handle_conclusion(now(), sent, Conclusion::Answered(Answer::Custody));
     let (handed, to, parcel) = dispatched(&mut gateway).unwrap();
     assert_eq!(to.to_string(), OLD_PEER);

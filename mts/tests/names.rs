@@ -13,7 +13,7 @@ use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, LegacySource, Parcel, Principal,
-    Signature, Stream, Verdict,
+    Reaction, Signature, Stream,
 };
 
 const ARM: Incarnation = Incarnation::from_u64(0xa);
@@ -84,8 +84,8 @@ fn arrive(core: &mut Core, principal: Principal, sequence: u64, letter: Letter) 
         ticket: None,
     };
     match core.handle_arrival(now(), Kind::Tcp, arrival) {
-        Verdict::Now(answer) => answer,
-        verdict @ Verdict::Later => panic!("{verdict:?}"),
+        Reaction::Now(answer) => answer,
+        verdict @ Reaction::Later => panic!("{verdict:?}"),
     }
 }
 

@@ -11,7 +11,7 @@ use fipa_mts::core::{Action, Core, CoreConfig, MAX_DEADLINE, Now};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind, Location,
-    Mandate, Parcel, Principal, Stream, TransportError, TransportErrorKind, Verdict,
+    Mandate, Parcel, Principal, Reaction, Stream, TransportError, TransportErrorKind,
 };
 
 use self::common::letter;
@@ -88,7 +88,7 @@ impl Gateway {
         self.conclude(attempt, Conclusion::NotSent(full));
     }
 
-    fn letter(&mut self, from: &Hop) -> Verdict {
+    fn letter(&mut self, from: &Hop) -> Reaction {
         self.sequence += 1;
         let parcel = Parcel {
             receiver: "arm".into(),
@@ -111,7 +111,7 @@ impl Gateway {
 
     /// A letter of this service is taken. Returns the report about it, if it is sent.
     fn report(&mut self, from: &Hop) -> Vec<(AttemptId, Parcel)> {
-        assert_eq!(self.letter(from), Verdict::Now(Answer::Custody));
+        assert_eq!(self.letter(from), Reaction::Now(Answer::Custody));
         let [(letter, _)] = &self.sent()[..] else {
             panic!("no letter");
         };
@@ -286,7 +286,7 @@ fn a_question_about_a_letter_brings_its_report_again() {
     };
     let now = gateway.clocks();
     let verdict = gateway.core.handle_arrival(now, Kind::Tcp, arrival);
-    assert_eq!(verdict, Verdict::Now(Answer::Accepted));
+    assert_eq!(verdict, Reaction::Now(Answer::Accepted));
     let (_, again) = only(&gateway.sent());
     assert_eq!(again, sequence);
 }

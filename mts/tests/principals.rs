@@ -16,8 +16,8 @@ use fipa_sds::{
 };
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
-    Kind, Location, Mandate, Outcome, Parcel, Principal, Realm, Report, Stream, Ticket,
-    TransportError, TransportErrorKind, Verdict,
+    Kind, Location, Mandate, Outcome, Parcel, Principal, Reaction, Realm, Report, Stream, Ticket,
+    TransportError, TransportErrorKind,
 };
 
 use self::common::letter;
@@ -118,7 +118,7 @@ impl Bench {
         from: Hop,
         stream: (Incarnation, Incarnation),
         what: (u64, Body),
-    ) -> Verdict {
+    ) -> Reaction {
         let ((sender, receiver), (sequence, body)) = (stream, what);
         self.tickets += 1;
         let parcel = Parcel {
@@ -152,14 +152,14 @@ impl Bench {
         self.core.handle_arrival(self.now, Kind::Tcp, arrival)
     }
 
-    fn letter(&mut self, from: Hop, stream: (Incarnation, Incarnation), sequence: u64) -> Verdict {
+    fn letter(&mut self, from: Hop, stream: (Incarnation, Incarnation), sequence: u64) -> Reaction {
         self.arrives(from, stream, (sequence, Body::Letter(letter())))
     }
 }
 
-fn is_refused(verdict: &Verdict) -> bool {
+fn is_refused(verdict: &Reaction) -> bool {
     let reason = FailureReason::Refused;
-    matches!(verdict, Verdict::Now(Answer::Failed { reason: it, .. }) if *it == reason)
+    matches!(verdict, Reaction::Now(Answer::Failed { reason: it, .. }) if *it == reason)
 }
 
 #[test]
@@ -171,7 +171,7 @@ fn a_gateway_speaks_for_itself() {
     let goodbye = bench.letter(link(HONEST, LIAR), (HONEST, GATEWAY), 1 << 48);
     assert!(is_refused(&goodbye), "{goodbye:?}");
     let own = bench.letter(link(HONEST, HONEST), (HONEST, GATEWAY), 1);
-    assert_eq!(own, Verdict::Now(Answer::Accepted));
+    assert_eq!(own, Reaction::Now(Answer::Accepted));
 }
 
 /// Sequences begin with 1, and a predecessor is below its letter: what follows predecessors ends.
@@ -187,7 +187,7 @@ fn a_letter_that_is_its_own_predecessor_is_refused() {
     }
     bench.after = 4;
     let next = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 5);
-    assert_eq!(next, Verdict::Later);
+    assert_eq!(next, Reaction::Later);
 }
 
 #[test]
@@ -200,7 +200,7 @@ fn letters_in_the_stream_of_another_host_are_refused() {
         assert!(is_refused(&junk), "{junk:?}");
     }
     let real = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
-    assert_eq!(real, Verdict::Later);
+    assert_eq!(real, Reaction::Later);
     // Another host cannot speak for an agent of this one either.
     let own = bench.letter(link(LIAR, LIAR), (ARM, GATEWAY), 1);
     assert!(is_refused(&own), "{own:?}");
@@ -212,7 +212,7 @@ fn letters_of_a_listed_agent_wait_until_its_gateway_has_introduced_itself() {
     let away = Incarnation::from_u64(8);
     let mut bench = Bench::with(&[("rover", ROVER, away)]);
     let early = bench.letter(link(LIAR, LIAR), (ROVER, ARM), 1);
-    assert_eq!(early, Verdict::Now(Answer::Busy));
+    assert_eq!(early, Reaction::Now(Answer::Busy));
     let introduction = Introduction {
         name: "away".into(),
         hop: link(away, away),
@@ -223,7 +223,7 @@ fn letters_of_a_listed_agent_wait_until_its_gateway_has_introduced_itself() {
     let junk = bench.letter(link(LIAR, LIAR), (ROVER, ARM), 1);
     assert!(is_refused(&junk), "{junk:?}");
     let real = bench.letter(link(away, away), (ROVER, ARM), 1);
-    assert_eq!(real, Verdict::Later);
+    assert_eq!(real, Reaction::Later);
 }
 
 #[test]
@@ -231,7 +231,7 @@ fn letters_of_one_host_are_not_relayed_to_another() {
     let mut bench = Bench::new();
     let own = Incarnation::from_u64(99);
     let verdict = bench.letter(link(LIAR, LIAR), (own, ROVER), 1);
-    let Verdict::Now(Answer::Failed { reason, .. }) = verdict else {
+    let Reaction::Now(Answer::Failed { reason, .. }) = verdict else {
         panic!("{verdict:?}");
     };
     assert_eq!(reason, FailureReason::NoSuchAgent);
@@ -242,7 +242,7 @@ fn an_unknown_sender_belongs_to_the_first_link() {
     let mut bench = Bench::new();
     let stranger = Incarnation::from_u64(99);
     let first = bench.letter(link(HONEST, HONEST), (stranger, ARM), 1);
-    assert_eq!(first, Verdict::Later);
+    assert_eq!(first, Reaction::Later);
     let second = bench.letter(link(LIAR, LIAR), (stranger, ARM), 2);
     assert!(is_refused(&second), "{second:?}");
 }
@@ -253,7 +253,7 @@ fn a_service_that_introduces_itself_as_an_agent_of_another_host_takes_nothing_fr
     let mut bench = Bench::new();
     let stranger = Incarnation::from_u64(99);
     let heard = bench.letter(link(HONEST, HONEST), (stranger, ARM), 1);
-    assert_eq!(heard, Verdict::Later);
+    assert_eq!(heard, Reaction::Later);
     for agent in [ROVER, stranger] {
         let introduction = Introduction {
             name: "rover".into(),
@@ -267,9 +267,9 @@ fn a_service_that_introduces_itself_as_an_agent_of_another_host_takes_nothing_fr
         assert!(is_refused(&junk), "{junk:?}");
         // A letter of the service itself is of another realm.
         let own = bench.letter(link(agent, LIAR), (agent, ARM), 2);
-        assert_eq!(own, Verdict::Later);
+        assert_eq!(own, Reaction::Later);
         let real = bench.letter(link(HONEST, HONEST), (agent, ARM), 2);
-        assert_eq!(real, Verdict::Later, "of {agent}");
+        assert_eq!(real, Reaction::Later, "of {agent}");
     }
 }
 
@@ -309,12 +309,12 @@ fn a_registration_that_two_certificates_list_is_two_senders() {
     };
     for sequence in 1..=3 {
         let stray = letter(&mut bench, LIAR, "stray", sequence);
-        assert_eq!(stray, Verdict::Later);
+        assert_eq!(stray, Reaction::Later);
     }
     let mut realms = HashSet::new();
     for sequence in 1..=3 {
         let real = letter(&mut bench, HONEST, "rover", sequence);
-        assert_eq!(real, Verdict::Later, "{sequence}");
+        assert_eq!(real, Reaction::Later, "{sequence}");
     }
     while let Some((_, _, parcel)) = dispatched(&mut bench) {
         assert_eq!(parcel.stream.sender, ROVER);
@@ -424,7 +424,7 @@ fn only_a_service_that_was_handed_a_letter_can_report_on_it() {
 /// letter's parcel.
 fn handed_to_process(bench: &mut Bench) -> Parcel {
     let taken = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
-    assert_eq!(taken, Verdict::Later);
+    assert_eq!(taken, Reaction::Later);
     let (attempt, location, parcel) = dispatched(bench).expect("the letter is passed on");
     assert_eq!(location.incarnation(), PROCESS);
     let custody = Conclusion::Answered(Answer::Custody);
@@ -554,14 +554,14 @@ fn only_the_service_that_handed_a_letter_over_lowers_its_predecessor() {
         .core
         .set_view(Arc::new(MergedDirectory::new(vec![own])));
     let handed = bench.letter(process_at("tcp://127.0.0.1:9"), (camera, ARM), 7);
-    assert_eq!(handed, Verdict::Later);
+    assert_eq!(handed, Reaction::Later);
     let note = |bench: &mut Bench, from| bench.arrives(from, (camera, ARM), (7, Body::Predecessor));
     for other in [link(LIAR, LIAR), link(PROCESS, LIAR), stranger(PROCESS)] {
         let answer = note(&mut bench, other);
-        assert_ne!(answer, Verdict::Now(Answer::Accepted));
+        assert_ne!(answer, Reaction::Now(Answer::Accepted));
     }
     let own = note(&mut bench, process_at("tcp://127.0.0.1:9"));
-    assert_eq!(own, Verdict::Now(Answer::Accepted));
+    assert_eq!(own, Reaction::Now(Answer::Accepted));
 }
 
 /// The names of gateways and agents of this host are public.
@@ -604,7 +604,7 @@ fn letters_that_one_receiver_leaves_in_custody_do_not_use_up_the_room_of_others(
     let fill = |bench: &mut Bench, receiver| {
         let verdict = |sequence| bench.letter(link(HONEST, HONEST), (ROVER, receiver), sequence);
         let verdicts = (1..=1000).map(verdict);
-        verdicts.take_while(|it| *it == Verdict::Later).count()
+        verdicts.take_while(|it| *it == Reaction::Later).count()
     };
     let (arm, lamp) = (fill(&mut bench, ARM), fill(&mut bench, LAMP));
     assert!(arm < 1000, "the custody is bounded");
@@ -612,7 +612,7 @@ fn letters_that_one_receiver_leaves_in_custody_do_not_use_up_the_room_of_others(
 }
 
 /// Invented senders, each with one small letter, from one link.
-fn invent(bench: &mut Bench, senders: std::ops::Range<u64>) -> Vec<Verdict> {
+fn invent(bench: &mut Bench, senders: std::ops::Range<u64>) -> Vec<Reaction> {
     let senders = senders.map(|sender| Incarnation::from_u64(1000 + sender));
     let letters = senders.map(|sender| bench.letter(link(LIAR, LIAR), (sender, ARM), 1));
     letters.collect()
@@ -633,10 +633,10 @@ fn letters_of_invented_senders_take_bounded_memory() {
     let mut bench = Bench::new();
     bench.core = Core::new(config, Arc::new(MergedDirectory::new(vec![own])));
     let verdicts = invent(&mut bench, 0..10_000);
-    let taken = verdicts.iter().filter(|it| **it == Verdict::Later).count();
+    let taken = verdicts.iter().filter(|it| **it == Reaction::Later).count();
     // Half of the custody is for other receivers.
     assert!((1000..=2048).contains(&taken), "{taken} letters");
-    let held_back = |it: &&Verdict| **it == Verdict::Now(Answer::Busy);
+    let held_back = |it: &&Reaction| **it == Reaction::Now(Answer::Busy);
     let held_back = verdicts.iter().filter(held_back).count();
     assert_eq!(taken + held_back, verdicts.len());
     let lanes = lanes(&mut bench);
@@ -654,7 +654,7 @@ fn a_peer_that_invents_senders_makes_few_of_them_known() {
         let letter = letter_for(&message.build().unwrap(), SystemTime::UNIX_EPOCH).unwrap();
         let stream = (Incarnation::from_u64(1000 + number), ARM);
         let verdict = bench.arrives(link(LIAR, LIAR), stream, (1, Body::Letter(letter)));
-        assert_eq!(verdict, Verdict::Later);
+        assert_eq!(verdict, Reaction::Later);
         let actions = std::iter::from_fn(|| bench.core.poll_action());
         actions
             .filter(|action| matches!(action, Action::Heard { .. }))
@@ -686,7 +686,7 @@ fn small_letters_take_bounded_memory() {
         let stream = (Incarnation::from_u64(1000 + sender), ARM);
         for sequence in 1..=1000 {
             let verdict = bench.letter(link(LIAR, LIAR), stream, sequence);
-            taken += usize::from(verdict == Verdict::Later);
+            taken += usize::from(verdict == Reaction::Later);
         }
     }
     // A letter has 71 bytes, and half of the custody is for other receivers.
@@ -763,7 +763,7 @@ enum Position {
 fn with_letter_for_rover(position: Position) -> (Bench, Option<AttemptId>) {
     let mut bench = Bench::new();
     let taken = bench.letter(process_at("shm://arms"), (ARM, ROVER), 1);
-    assert_eq!(taken, Verdict::Later);
+    assert_eq!(taken, Reaction::Later);
     let (attempt, location, _) = dispatched(&mut bench).expect("the letter is passed on");
     assert_eq!(location.incarnation(), HONEST);
     let conclusion = match position {
@@ -864,7 +864,7 @@ fn withdrawn_trust_in_another_gateway_ends_no_letter() {
 fn letters_that_were_taken_from_a_gateway_before_it_lost_trust_are_delivered() {
     let mut bench = Bench::new();
     let taken = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
-    assert_eq!(taken, Verdict::Later);
+    assert_eq!(taken, Reaction::Later);
     let (attempt, _, _) = dispatched(&mut bench).expect("the letter is passed on");
     let busy = Conclusion::Answered(Answer::Busy);
     bench.core.handle_conclusion(bench.now, attempt, busy);

@@ -19,7 +19,7 @@ use fipa_mts::{AccessGate, LetterParts, Link, Mts, RuntimeConfig, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, Hop, Incarnation, Kind, LegacySource, Location, Parcel, Principal,
-    Signature, Stream, Ticket, Transport, Verdict,
+    Reaction, Signature, Stream, Ticket, Transport,
 };
 use parking_lot::Mutex;
 
@@ -130,7 +130,7 @@ fn the_service_is_not_locked_while_the_gate_reads_a_letter() {
         },
         ticket: Some(Ticket(1)),
     });
-    assert_eq!(verdict, Verdict::Now(Answer::Accepted));
+    assert_eq!(verdict, Reaction::Now(Answer::Accepted));
     sink.arrived_unframed(letter(), Kind::Tcp, LEGACY_PEER);
     assert_eq!(*gate.asked.lock(), ["arm", "arm"]);
 }

@@ -13,7 +13,7 @@ use fipa_mts::{LetterDraft, letter_by, letter_for};
 use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Principal, Stream, Ticket, TransportError, TransportErrorKind, Verdict,
+    Outcome, Parcel, Principal, Reaction, Stream, Ticket, TransportError, TransportErrorKind,
 };
 
 const ARM: Incarnation = Incarnation::from_u64(0xa);
@@ -313,8 +313,8 @@ fn answer(forwards: bool, is_own: bool, len: usize) -> Option<Answer> {
         utc: SystemTime::UNIX_EPOCH,
     };
     match core.handle_arrival(now, Kind::Tcp, arrival) {
-        Verdict::Now(answer) => Some(answer),
-        Verdict::Later => None,
+        Reaction::Now(answer) => Some(answer),
+        Reaction::Later => None,
     }
 }
 

@@ -21,8 +21,8 @@ use fipa_mts::{AccessGate, LetterParts, Link, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource, Location,
-    Outcome, Parcel, Principal, Report, Signature, Stream, Ticket, TransportError,
-    TransportErrorKind, Verdict,
+    Outcome, Parcel, Principal, Reaction, Report, Signature, Stream, Ticket, TransportError,
+    TransportErrorKind,
 };
 use rustix::time::{ClockId, clock_gettime};
 
@@ -112,7 +112,7 @@ fn processor_time() -> Duration {
     clock_gettime(ClockId::ThreadCPUTime).try_into().unwrap()
 }
 
-fn arrives(core: &mut Core, stream: (u64, u64), sequence: u64, body: Body) -> Verdict {
+fn arrives(core: &mut Core, stream: (u64, u64), sequence: u64, body: Body) -> Reaction {
     let arrival = arrival(stream, sequence, body);
     let read = core.reader().read_arrival(&arrival);
     core.handle_read_arrival(now(), Kind::Tcp, arrival, read)
@@ -143,7 +143,7 @@ fn arrival(stream: (u64, u64), sequence: u64, body: Body) -> Arrival {
 }
 
 /// Handles a letter of another gateway, which is read before, as the runtime does.
-fn framed(core: &mut Core, what: &str, letter: Letter) -> Verdict {
+fn framed(core: &mut Core, what: &str, letter: Letter) -> Reaction {
     let bytes = letter.len();
     let arrival = arrival((9, 100), 1, Body::Letter(letter));
     let read = core.reader().read_arrival(&arrival);
@@ -245,7 +245,7 @@ fn a_letter_with_the_maximum_of_parameters() {
         let letter = letter(&["arm_0".to_owned()], parameters);
         let what = format!("{parameters} parameters");
         let verdict = framed(&mut core, &what, letter);
-        assert_eq!(verdict, Verdict::Later);
+        assert_eq!(verdict, Reaction::Later);
     }
 }
 
@@ -415,8 +415,8 @@ fn crowded(agents: u64) -> (Core, Arc<dyn Directory>, Instant) {
         let arrival = arrival(stream, 1, Body::Letter(letter.clone()));
         let read = core.reader().read_arrival(&arrival);
         match core.handle_read_arrival(came, Kind::Tcp, arrival, read) {
-            Verdict::Later => lanes += 1,
-            verdict => assert_eq!(verdict, Verdict::Now(Answer::Busy)),
+            Reaction::Later => lanes += 1,
+            verdict => assert_eq!(verdict, Reaction::Now(Answer::Busy)),
         }
         while let Some(action) = core.poll_action() {
             if let Action::Refresh { number } = action {
@@ -469,7 +469,7 @@ fn full_lane() -> (Core, Arc<dyn Directory>, Instant, Vec<AttemptId>) {
         let arrival = arrival((9, 100), sequence, Body::Letter(letter.clone()));
         let read = core.reader().read_arrival(&arrival);
         let verdict = core.handle_read_arrival(came, Kind::Tcp, arrival, read);
-        assert_eq!(verdict, Verdict::Later);
+        assert_eq!(verdict, Reaction::Later);
     }
     let mut sent = Vec::new();
     while let Some(action) = core.poll_action() {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, Performative};
-use fipa_content::{Content, Dialect, Term, Wff};
+use fipa_content::{Content, SlDialect, Term, Wff};
 
 use crate::description::{AMS_DESCRIPTION, CONSTRAINTS, Constraints, matches_agent};
 use crate::df::{authorize, result};
@@ -15,8 +15,8 @@ use crate::kept::{KeptDescription, Text, left, read_object};
 use crate::request::{self, Rejection, Request};
 use crate::search::max_results;
 use crate::{
-    AddressBook, AmsDescription, Answer, ApDescription, Asker, Now, Platform, State, addresses_for,
-    limits, located,
+    AddressBook, AmsDescription, Answer, ApDescription, Asker, Platform, PlatformTime, State,
+    addresses_for, limits, located,
 };
 
 /// The agent management system of a platform.
@@ -97,7 +97,7 @@ impl Ams {
     /// Handles a message to the agent. `residents` are the agents of this host, sorted by name.
     pub fn handle_message(
         &mut self,
-        now: Now,
+        now: PlatformTime,
         asker: &Asker,
         message: &Message,
         residents: &[Resident],
@@ -211,7 +211,7 @@ impl Ams {
 
     fn request<'m>(
         &mut self,
-        now: Now,
+        now: PlatformTime,
         asker: &Asker,
         message: &'m Message,
         residents: &[Resident],
@@ -223,7 +223,7 @@ impl Ams {
 
     fn execute(
         &mut self,
-        now: Now,
+        now: PlatformTime,
         asker: &Asker,
         request: &Request<'_>,
         residents: &[Resident],
@@ -256,7 +256,7 @@ impl Ams {
                 let description = self.platform.to_term();
                 // The standard returns the description, JADE a sequence of one.
                 let value = match asker.dialect {
-                    Dialect::Jade => Term::Sequence(vec![description]),
+                    SlDialect::Jade => Term::Sequence(vec![description]),
                     _ => description,
                 };
                 let action = Box::new(request.action.clone().into());
@@ -270,7 +270,7 @@ impl Ams {
 
     fn register(
         &mut self,
-        now: Now,
+        now: PlatformTime,
         asker: &Asker,
         description: AmsDescription,
         residents: &[Resident],
@@ -302,7 +302,7 @@ impl Ams {
 
     fn modify(
         &mut self,
-        now: Now,
+        now: PlatformTime,
         asker: &Asker,
         description: AmsDescription,
         residents: &[Resident],

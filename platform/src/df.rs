@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, Performative, Time};
-use fipa_content::{Content, Dialect, Term, Wff};
+use fipa_content::{Content, SlDialect, Term, Wff};
 
 use crate::description::{Constraints, described};
 use crate::exception::Exception;
@@ -17,8 +17,8 @@ use crate::request::{self, Rejection, Request};
 use crate::search::{Comparisons, max_results};
 use crate::subscription::{Subscription, checked_template};
 use crate::{
-    AddressBook, AgentDescription, Answer, Asker, Now, Platform, SubscriptionId, addresses_for,
-    limits, located,
+    AddressBook, AgentDescription, Answer, Asker, Platform, PlatformTime, SubscriptionId,
+    addresses_for, limits, located,
 };
 
 /// The directory facilitator of a platform.
@@ -157,7 +157,7 @@ impl Df {
     }
 
     /// Handles a message to the agent.
-    pub fn handle_message(&mut self, now: Now, asker: &Asker, message: &Message) {
+    pub fn handle_message(&mut self, now: PlatformTime, asker: &Asker, message: &Message) {
         self.expire(now.at);
         match message.performative() {
             Performative::Request => {
@@ -227,7 +227,7 @@ impl Df {
     /// Sets the descriptions from the directory facilitators of other hosts. Those that are missing end
     /// at once. Returns whether a host has sent more than [`limits::REMOTE_CHANGES`] new descriptions:
     /// the caller then calls again after [`limits::REMOTE_PAUSE`], and never earlier.
-    pub fn handle_remote(&mut self, now: Now, entries: &[RemoteEntry]) -> bool {
+    pub fn handle_remote(&mut self, now: PlatformTime, entries: &[RemoteEntry]) -> bool {
         let named: BTreeMap<&str, &RemoteEntry> = entries
             .iter()
             .filter(|entry| entry.ends > now.at)
@@ -328,7 +328,7 @@ impl Df {
     /// not valid are left out. Those of platforms that do not `stay` end, which subscribers are told.
     pub fn take_over(
         &mut self,
-        now: Now,
+        now: PlatformTime,
         elapsed: Duration,
         (entries, subscriptions): (&[KeptDescription], &[KeptSubscription]),
         stays: impl Fn(Platform) -> bool,
@@ -351,7 +351,12 @@ impl Df {
         self.expire(now.at);
     }
 
-    fn kept_entry(&self, now: Now, elapsed: Duration, kept: &KeptDescription) -> Option<Entry> {
+    fn kept_entry(
+        &self,
+        now: PlatformTime,
+        elapsed: Duration,
+        kept: &KeptDescription,
+    ) -> Option<Entry> {
         if self.entries.contains_key(&kept.name) || self.is_full(kept.platform) {
             return None;
         }
@@ -374,7 +379,7 @@ impl Df {
         ))
     }
 
-    fn take_over_subscription(&mut self, now: Now, kept: &KeptSubscription) {
+    fn take_over_subscription(&mut self, now: PlatformTime, kept: &KeptSubscription) {
         let Some((asker, message)) = kept.read() else {
             return;
         };
@@ -450,7 +455,7 @@ impl Df {
     /// Executes a request and returns the content of the answer.
     fn request<'m>(
         &mut self,
-        now: Now,
+        now: PlatformTime,
         asker: &Asker,
         message: &'m Message,
     ) -> Result<Vec<u8>, Rejection<'m>> {
@@ -461,7 +466,7 @@ impl Df {
 
     fn execute(
         &mut self,
-        now: Now,
+        now: PlatformTime,
         asker: &Asker,
         request: &Request<'_>,
     ) -> Result<Vec<u8>, Exception> {
@@ -696,7 +701,7 @@ impl Df {
         Ok(found.texts)
     }
 
-    fn subscribe(&mut self, now: Now, asker: &Asker, message: &Message) {
+    fn subscribe(&mut self, now: PlatformTime, asker: &Asker, message: &Message) {
         let read = match asker.is_proved {
             true => Subscription::read(message, asker, &self.id, now.at),
             // Notifications must not go to an agent that did not subscribe.
@@ -926,7 +931,7 @@ impl Found {
 
     /// Adds a description, unless the answer is long enough already. A description that the dialect has
     /// no notation for is left out.
-    fn add(&mut self, description: &AgentDescription, dialect: Dialect) -> bool {
+    fn add(&mut self, description: &AgentDescription, dialect: SlDialect) -> bool {
         let Ok(text) = request::print(dialect, &description.to_term()) else {
             return true;
         };
@@ -943,7 +948,7 @@ impl Found {
 pub(crate) fn result(
     request: &Request<'_>,
     found: Vec<Vec<u8>>,
-    dialect: Dialect,
+    dialect: SlDialect,
 ) -> Result<Vec<u8>, Exception> {
     let unprintable = |_| Exception::InternalError("cannot answer".to_owned());
     let empty = Wff::Result(
@@ -980,7 +985,7 @@ fn is_too_large(description: &AgentDescription) -> bool {
 /// Checks a description that is to be stored. Returns it with the granted lease, and the end of the
 /// lease.
 fn granted(
-    now: Now,
+    now: PlatformTime,
     asker: &Asker,
     mut description: AgentDescription,
 ) -> Result<(AgentDescription, Option<Instant>), Exception> {

@@ -1,7 +1,7 @@
 //! The reasons of refusals, failures and messages that are not understood (FIPA00023 clause 6.3).
 
 use fipa_acl::{Message, Performative, escape};
-use fipa_content::{Content, ContentExpression, Dialect, Term, Wff};
+use fipa_content::{Content, ContentExpression, SlDialect, Term, Wff};
 
 use crate::limits;
 
@@ -105,8 +105,8 @@ impl Exception {
 
     /// Returns the predicate. JADE begins the names of two predicates with a capital letter.
     #[must_use]
-    pub fn to_wff(&self, dialect: Dialect) -> Wff<'static> {
-        let is_jade = dialect == Dialect::Jade;
+    pub fn to_wff(&self, dialect: SlDialect) -> Wff<'static> {
+        let is_jade = dialect == SlDialect::Jade;
         let text = |text: &String| Term::from(text.clone());
         let (symbol, arguments) = match self {
             Self::UnsupportedAct(act) => ("unsupported-act", vec![text(act)]),

@@ -7,8 +7,10 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{AgentId, Dialect as AclDialect, Message, MessageBuilder, Payload, Representation};
-use fipa_content::{Content, Dialect, Term, Wff};
+use fipa_acl::{
+    AgentId, Message, MessageBuilder, Payload, Representation, Dialect as AclDialect,
+};
+use fipa_content::{Content, SlDialect, Term, Wff};
 use serde::{Deserialize, Serialize};
 
 use crate::{Asker, Platform, limits, request};
@@ -35,7 +37,9 @@ impl Text {
 
     /// Returns the text of an object.
     pub(crate) fn of_term(term: &Term<'_>) -> Option<Self> {
-        request::print(Dialect::Standard, term).ok().map(Self::new)
+        request::print(SlDialect::Standard, term)
+            .ok()
+            .map(Self::new)
     }
 
     pub(crate) fn as_bytes(&self) -> &[u8] {
@@ -122,7 +126,7 @@ impl KeptSubscription {
         Some(Self {
             name: asker.id.name().into(),
             platform: asker.platform,
-            is_jade: asker.dialect == Dialect::Jade,
+            is_jade: asker.dialect == SlDialect::Jade,
             asked: asker.asked.as_ref().map(|asked| asked.name().to_owned()),
             message: Text::new(message.ok()?.into()),
             changed: Some(Vec::new()),
@@ -139,7 +143,7 @@ impl KeptSubscription {
         }
         let mut asker = Asker::new(id, 0, self.platform);
         if self.is_jade {
-            asker.dialect = Dialect::Jade;
+            asker.dialect = SlDialect::Jade;
         }
         if let Some(asked) = &self.asked {
             asker.asked = Some(AgentId::new(&**asked).ok()?);

@@ -1,7 +1,7 @@
 //! The two agents of every FIPA platform (FIPA00023): the agent management system ([`Ams`]) lists the
 //! agents of the platform, and the directory facilitator ([`Df`]) lists the services of agents.
 //!
-//! Both are cores without sockets, threads and clocks: messages, the asker and [`Now`] go in,
+//! Both are cores without sockets, threads and clocks: messages, the asker and [`PlatformTime`] go in,
 //! [`Answer`]s come out. Registration, deregistration, modification and search follow
 //! `fipa-request`, subscriptions to the directory facilitator follow `fipa-subscribe`, in the ontology
 //! [`ONTOLOGY`] and the language FIPA-SL. [`AgentDescription`] and the other descriptions are the
@@ -13,7 +13,7 @@
 //!
 //! use fipa_acl::{AgentId, Message, Performative};
 //! use fipa_platform::{
-//!     AgentDescription, Asker, Constraints, Df, Function, Now, ONTOLOGY, Platform,
+//!     AgentDescription, Asker, Constraints, Df, Function, PlatformTime, ONTOLOGY, Platform,
 //!     ServiceDescription, found,
 //! };
 //!
@@ -28,7 +28,7 @@
 //!     services: vec![ServiceDescription::of_type("lifting")],
 //!     ..AgentDescription::default()
 //! };
-//! let now = Now { at: Instant::now(), wall: SystemTime::now() };
+//! let now = PlatformTime { at: Instant::now(), wall: SystemTime::now() };
 //! for (sender, function) in [
 //!     ("crane", Function::register(&crane)),
 //!     ("rover", Function::search(&template, &Constraints::all())),
@@ -100,7 +100,7 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use fipa_acl::{AgentId, Message};
-use fipa_content::Dialect;
+use fipa_content::SlDialect;
 use serde::{Deserialize, Serialize};
 
 pub use ams::{Ams, Resident};
@@ -124,7 +124,7 @@ pub const ONTOLOGY: &str = "fipa-agent-management";
     clippy::exhaustive_structs,
     reason = "the shells of the cores create it"
 )]
-pub struct Now {
+pub struct PlatformTime {
     /// The time by which leases end. A change of the clock of the host does not affect it.
     pub at: Instant,
     /// The time by which the date-times of messages are read and written.
@@ -145,7 +145,7 @@ pub struct Asker {
     /// Whether the connection proves the name. An agent without proof can search only.
     pub is_proved: bool,
     /// The dialect of SL that the agent writes and reads.
-    pub dialect: Dialect,
+    pub dialect: SlDialect,
     /// The identifier by which it asked the agent of this crate, if that is not the agent's own but
     /// another one of it. Answers have it as their sender.
     pub asked: Option<AgentId>,
@@ -165,7 +165,7 @@ impl Asker {
             registration,
             platform,
             is_proved: true,
-            dialect: Dialect::Standard,
+            dialect: SlDialect::Standard,
             asked: None,
         }
     }

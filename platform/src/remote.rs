@@ -7,10 +7,10 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::Time;
-use fipa_content::{Dialect, Term};
+use fipa_content::{SlDialect, Term};
 
 use crate::kept::read_object;
-use crate::{AgentDescription, Now, limits, request};
+use crate::{AgentDescription, PlatformTime, limits, request};
 
 /// The description of an agent of this host, for the directory facilitators of other hosts.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -63,14 +63,14 @@ pub(crate) fn text(description: &AgentDescription) -> Option<Arc<str>> {
         lease_time: None,
         ..description.clone()
     };
-    let text = request::print(Dialect::Standard, &description.to_term()).ok()?;
+    let text = request::print(SlDialect::Standard, &description.to_term()).ok()?;
     let text = String::from_utf8(text).ok()?;
     (text.len() <= limits::REMOTE_BYTES).then(|| text.into())
 }
 
 /// Reads the description of a remote entry. Returns `None` if it is not valid, too large or that of
 /// another agent.
-pub(crate) fn read(now: Now, entry: &RemoteEntry) -> Option<AgentDescription> {
+pub(crate) fn read(now: PlatformTime, entry: &RemoteEntry) -> Option<AgentDescription> {
     if entry.text.len() > limits::REMOTE_BYTES {
         return None;
     }
@@ -89,7 +89,7 @@ pub(crate) fn read(now: Now, entry: &RemoteEntry) -> Option<AgentDescription> {
 }
 
 /// Returns the lease of a remote entry as a time of the clock of this host.
-pub(crate) fn lease_time(now: Now, entry: &RemoteEntry) -> Option<Time> {
+pub(crate) fn lease_time(now: PlatformTime, entry: &RemoteEntry) -> Option<Time> {
     let left = entry.ends.saturating_duration_since(now.at);
     let ends = now.wall.checked_add(left).filter(|_| entry.has_lease)?;
     Time::from_system_time(ends).ok()

@@ -3,7 +3,8 @@
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 use fipa_content::{
-    ActionExpression, Content, ContentExpression, Dialect, Expression, Printer, Profile, Term, Wff,
+    ActionExpression, Content, ContentExpression, Expression, Printer, Profile, SlDialect, Term,
+    Wff,
 };
 
 use crate::exception::{Exception, repeated};
@@ -174,7 +175,7 @@ pub(crate) fn expects_answer(act: &Performative) -> bool {
 }
 
 pub(crate) fn print(
-    dialect: Dialect,
+    dialect: SlDialect,
     expression: &impl Expression,
 ) -> Result<Vec<u8>, fipa_content::PrintError> {
     Printer::new().dialect(dialect).print(expression)
@@ -191,7 +192,7 @@ pub(crate) fn rejected(
     let content = match action {
         Some(action) => Content::of_refusal(*action, wff),
         // The messages of JADE's own agents have this form.
-        None if asker.dialect == Dialect::Jade => Content::from(wff),
+        None if asker.dialect == SlDialect::Jade => Content::from(wff),
         None => {
             // The act of sending the message: FIPA00037 clause 3.13.
             let act = ActionExpression::Action {

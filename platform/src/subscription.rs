@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
-use fipa_content::{Content, ContentExpression, Dialect, IdentifyingExpression, Term, Wff};
+use fipa_content::{Content, ContentExpression, IdentifyingExpression, SlDialect, Term, Wff};
 
 use crate::description::searched;
 use crate::exception::Exception;
@@ -166,7 +166,7 @@ impl Subscription {
         self.under_way.clear();
     }
 
-    pub(crate) fn dialect(&self) -> Dialect {
+    pub(crate) fn dialect(&self) -> SlDialect {
         self.asker.dialect
     }
 

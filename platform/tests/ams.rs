@@ -6,7 +6,7 @@ mod common;
 
 use common::{Management, OTHER, asker, id, local, message, text};
 use fipa_acl::{Message, Performative};
-use fipa_content::Dialect;
+use fipa_content::SlDialect;
 use fipa_platform::{
     AmsDescription, ApDescription, Asker, Constraints, Exception, Function, Platform, Resident,
     State, limits,
@@ -173,7 +173,7 @@ fn the_platform_is_described_for_the_standard_and_for_jade() {
     assert_eq!(ApDescription::found(&answer).unwrap(), expected);
     assert!(text(&answer).contains("(get-description)) (ap-description :name mts"));
     let mut jade = asker("x@jade", Platform::Unproved);
-    jade.dialect = Dialect::Jade;
+    jade.dialect = SlDialect::Jade;
     let answer = it.call(0.0, &jade, &get).unwrap();
     assert!(
         text(&answer).contains("(sequence (ap-description"),

@@ -8,7 +8,7 @@ use common::{
     Facilitator, OTHER, all_lifting, asker, id, lifting, local, message, names, request, text, wall,
 };
 use fipa_acl::{Message, Performative, Time};
-use fipa_content::Dialect;
+use fipa_content::SlDialect;
 use fipa_platform::{
     AgentDescription, Asker, Constraints, Exception, Function, Platform, Property,
     ServiceDescription, found, limits, notified, registered, subscription,
@@ -694,7 +694,7 @@ fn subscriptions_are_bounded_per_agent_platform_and_in_all() {
 fn a_jade_agent_is_answered_in_its_dialect() {
     let mut it = Facilitator::new();
     let mut jade = asker("jade@host", Platform::Unproved);
-    jade.dialect = Dialect::Jade;
+    jade.dialect = SlDialect::Jade;
     let wrong = message(Performative::Request, "jade@host", b"((p))").language("prolog");
     let answer = it.tell(0.0, &jade, &wrong.build().unwrap()).unwrap();
     assert_eq!(text(&answer.message), "((Unsupported-value language))");

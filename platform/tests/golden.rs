@@ -10,7 +10,7 @@ use std::path::Path;
 use bytes::Bytes;
 use common::{Clock, id};
 use fipa_acl::{Message, Payload};
-use fipa_content::{Content, Dialect, Printer};
+use fipa_content::{Content, Printer, SlDialect};
 use fipa_platform::{Ams, ApDescription, Asker, Df, Platform, Resident, found};
 
 fn recorded(name: &str) -> Message {
@@ -23,7 +23,7 @@ fn recorded(name: &str) -> Message {
 fn a_recorded_search_is_answered_as_jade_answered_it() {
     let request = recorded("df_search_request.str");
     let expected = recorded("df_search_reply.str");
-    for dialect in [Dialect::Standard, Dialect::Jade] {
+    for dialect in [SlDialect::Standard, SlDialect::Jade] {
         // JADE's DF has the address of its platform.
         let df = expected.sender().unwrap().clone();
         let mut df = Df::new(df);
@@ -62,7 +62,7 @@ fn exchanges() -> Vec<(String, Message, Option<Message>)> {
 /// Returns a content in the standard dialect: blanks and unnecessary quotes are no difference. JADE's content of
 /// some messages is no SL and stays as it is.
 fn normal(content: &[u8]) -> String {
-    match Content::parse_in(Dialect::Jade, content) {
+    match Content::parse_in(SlDialect::Jade, content) {
         Ok(parsed) => String::from_utf8(Printer::new().print(&parsed).unwrap()).unwrap(),
         Err(_) => String::from_utf8(content.to_vec()).unwrap(),
     }
@@ -121,7 +121,7 @@ fn recorded_requests_are_answered_as_jade_answered_them() {
     let mut differences = Vec::new();
     for (name, request, expected) in exchanges() {
         let mut asker = Asker::new(request.sender().unwrap().clone(), 0, Platform::Unproved);
-        asker.dialect = Dialect::Jade;
+        asker.dialect = SlDialect::Jade;
         let now = clock.after(0.0);
         let answer = match request.receivers()[0].name() {
             "df@jadetest" => {

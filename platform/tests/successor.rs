@@ -10,7 +10,7 @@ use common::{
     Facilitator, Management, OTHER, all_lifting, asker, id, lifting, local, message, names,
 };
 use fipa_acl::{AgentId, Message, Performative, Time};
-use fipa_content::{Dialect, Term};
+use fipa_content::{SlDialect, Term};
 use fipa_platform::{
     AgentDescription, AmsDescription, Asker, Constraints, Exception, Function, KeptDescription,
     KeptSubscription, Platform, Property, ServiceDescription, State, limits, notified,
@@ -136,7 +136,7 @@ fn descriptions_come_back_with_their_leases() {
 fn subscriptions_of_other_hosts_go_on_and_miss_nothing() {
     let mut it = Facilitator::new();
     let mut jade = unregistered("jade", Platform::Unproved);
-    jade.dialect = Dialect::Jade;
+    jade.dialect = SlDialect::Jade;
     let far = unregistered("far", OTHER);
     // The others subscribe again.
     let others = [local("rover"), asker("farther", OTHER)];

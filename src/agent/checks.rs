@@ -8,7 +8,7 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{Message, Performative};
 use fipa_monitor::{
-    Header, History, Library, LibraryError, LibraryFull, Limits, Monitor, Now, Policy,
+    Header, History, Library, LibraryError, LibraryFull, Limits, Moment, Monitor, Policy,
     SnapshotError, Verdict, Violation, ViolationKind,
 };
 use fipa_mts::core::Received;
@@ -426,10 +426,10 @@ fn groups<'m>(message: &'m Message, directory: &dyn Directory) -> Vec<(&'m str, 
 }
 
 /// Returns the current time. The monotonic clock counts while the machine is suspended.
-pub(crate) fn now() -> Now {
+pub(crate) fn now() -> Moment {
     let elapsed = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
     let elapsed = Duration::try_from(elapsed).unwrap_or_default();
-    Now::new(SystemTime::now(), elapsed)
+    Moment::new(SystemTime::now(), elapsed)
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use std::any::Any;
 use std::sync::{Arc, Weak};
 
 use fipa_acl::Message;
-use fipa_locking::{Kind, Options, codec};
+use fipa_locking::{Algorithm, Options, codec};
 use parking_lot::Mutex;
 
 use crate::agent::incoming::Incoming;
@@ -54,7 +54,7 @@ pub(crate) struct LockSlot(pub(crate) Mutex<Slot>);
 #[derive(Default)]
 pub(crate) struct Slot {
     /// The options, unless they are the defaults.
-    pub(crate) options: Option<(Kind, Options)>,
+    pub(crate) options: Option<(Algorithm, Options)>,
     /// Whether legacy peers are asked whether they use locks.
     pub(crate) legacy_peers: bool,
     pub(crate) running: Option<Running>,

@@ -8,7 +8,7 @@ pub(crate) struct Owner {
     process: OwnerProcess,
     /// Its check costs no system call.
     #[cfg(feature = "shm")]
-    mark: fipa_transport_shm::Owner,
+    mark: fipa_transport_shm::OwnerMark,
 }
 
 impl Owner {
@@ -17,7 +17,7 @@ impl Owner {
         Self {
             process: OwnerProcess::this(),
             #[cfg(feature = "shm")]
-            mark: fipa_transport_shm::Owner::this(),
+            mark: fipa_transport_shm::OwnerMark::this(),
         }
     }
 

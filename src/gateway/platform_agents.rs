@@ -10,13 +10,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Message, escape_name};
-use fipa_content::Dialect;
+use fipa_content::SlDialect;
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::dial::Endpoint;
 use fipa_mts::{Sending, letter_for};
 use fipa_platform::{
-    AddressBook, Ams, Answer, ApDescription, Asker, Df, LocalEntry, Now, Platform, RemoteEntry,
-    Resident, SubscriptionId, limits,
+    AddressBook, Ams, Answer, ApDescription, Asker, Df, LocalEntry, Platform, PlatformTime,
+    RemoteEntry, Resident, SubscriptionId, limits,
 };
 use fipa_sds::{
     DfEntry, Directory, Entry, Exchange, MergedDirectory, OwnDfEntry, Reach, RegisterError,
@@ -114,7 +114,7 @@ impl PlatformAgents {
         asker.is_proved = is_proved;
         let is_jade = |location: &Location| location.signature().is_jade();
         if entry.locations.iter().any(is_jade) {
-            asker.dialect = Dialect::Jade;
+            asker.dialect = SlDialect::Jade;
         }
         Some(asker)
     }
@@ -703,8 +703,8 @@ fn local_address_to(at: SocketAddr) -> Option<IpAddr> {
     Some(socket.local_addr().ok()?.ip().to_canonical())
 }
 
-fn now() -> Now {
-    Now {
+fn now() -> PlatformTime {
+    PlatformTime {
         at: Instant::now(),
         wall: SystemTime::now(),
     }

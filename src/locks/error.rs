@@ -3,7 +3,7 @@
 use std::io;
 
 use fipa_acl::BuildError;
-use fipa_locking::{Failure, Kind, NameError, OptionsError, Refusal, Resource};
+use fipa_locking::{Failure, Algorithm, NameError, OptionsError, Refusal, Resource};
 use fipa_transport::Forked;
 use fipa_transport::threads::ThreadError;
 
@@ -63,9 +63,9 @@ pub enum LockError {
         /// The resource.
         resource: String,
         /// The algorithm of the owner.
-        owner: Kind,
+        owner: Algorithm,
         /// The algorithm of this agent.
-        here: Kind,
+        here: Algorithm,
     },
     /// The lock was lost: its lease ended without a renewal, or the owner has ended it.
     #[error("the lock of {resource:?} was lost")]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::MessageBuilder;
-use fipa_locking::{AnyAlgorithm, ClaimId, Fence, Kind, Locks, Millis, Peer, Resource};
+use fipa_locking::{Algorithm, AnyAlgorithm, ClaimId, Fence, Locks, Millis, Peer, Resource};
 use tokio::sync::watch;
 
 use super::shell::{self, ClaimState, Shared};
@@ -182,7 +182,7 @@ fn listed_owners(
     core: &AgentCore,
     shared: &Shared,
     resources: &[Resource],
-) -> Vec<(Resource, Peer, Option<Kind>)> {
+) -> Vec<(Resource, Peer, Option<Algorithm>)> {
     let directory = core.endpoint.domain.directory();
     let listed = |resource: &Resource| {
         let known = shared.read(|locks, _| locks.owner_of(resource).cloned());

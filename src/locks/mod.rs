@@ -54,7 +54,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 pub use fipa_locking::{
-    Admission, Ending, Fence, FenceError, Kind as Algorithm, NameError, NotAdmitted, OptionsError,
+    Admission, Algorithm, Ending, Fence, FenceError, NameError, NotAdmitted, OptionsError,
     OwnerStateError, Refusal,
 };
 

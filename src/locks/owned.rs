@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::{ErrorChain, Message};
-use fipa_locking::{Ending, Fence, Grant, Kind, Options, OwnerState, Resource};
+use fipa_locking::{Ending, Fence, Grant, Algorithm, Options, OwnerState, Resource};
 use fipa_sds::{Entry, RegisterError, Role};
 use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
@@ -310,7 +310,7 @@ fn prepare(
     core: &AgentCore,
     resource: &Resource,
     options: &OwnOptions,
-    algorithm: Kind,
+    algorithm: Algorithm,
 ) -> Result<Files, OwnError> {
     let domain = &core.endpoint.domain;
     let lease = clock::millis(options.lease);
@@ -399,8 +399,8 @@ pub(super) fn listed(
 pub(super) fn listed_owner(
     directory: DirectoryView<'_>,
     resource: &Resource,
-) -> Option<(Arc<Entry>, Option<Kind>)> {
+) -> Option<(Arc<Entry>, Option<Algorithm>)> {
     let entry = directory.lookup(&entry_name(resource))?;
     let (_, owner) = listed(directory, &entry)?;
-    Some((owner, Kind::named(&entry.description)))
+    Some((owner, Algorithm::named(&entry.description)))
 }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Performative, escape, escape_name};
 use fipa_locking::{
-    Action, AnyAlgorithm, ClaimId, Dialect, Event, Failure, Fence, Kind, LockMessage, Locks,
+    Action, AnyAlgorithm, ClaimId, Event, Failure, Fence, Algorithm, LockDialect, LockMessage, Locks,
     Millis, Peer, Resource, codec,
 };
 use fipa_mts::letter_for;
@@ -169,7 +169,7 @@ pub(super) struct Shared {
     sending: Mutex<()>,
     /// Wakes the task after a change of the next timeout.
     changed: Notify,
-    kind: Kind,
+    kind: Algorithm,
 }
 
 struct State {
@@ -389,7 +389,7 @@ impl Shared {
     /// Makes an agent of this library a member.
     fn meet(&self, core: &AgentCore, peer: &Peer) {
         self.act(core, |state, now, actions| {
-            state.core.join(now, peer, Dialect::Own, actions);
+            state.core.join(now, peer, LockDialect::Own, actions);
             state.note(peer);
         });
     }
@@ -398,12 +398,12 @@ impl Shared {
     pub(super) fn claim(
         &self,
         core: &AgentCore,
-        owners: &[(Resource, Peer, Option<Kind>)],
+        owners: &[(Resource, Peer, Option<Algorithm>)],
         begin: impl FnOnce(&mut Locks<AnyAlgorithm>, Millis, &mut Vec<Action>) -> ClaimId,
     ) -> (ClaimId, watch::Receiver<ClaimState>) {
         self.act(core, |state, now, actions| {
             for (resource, owner, algorithm) in owners {
-                let (own, core) = (Dialect::Own, &mut state.core);
+                let (own, core) = (LockDialect::Own, &mut state.core);
                 match algorithm {
                     Some(_) => core.owner_named(now, resource, owner, own, *algorithm, actions),
                     // The owner is asked.
@@ -519,7 +519,7 @@ impl Shared {
             if let (Some(owner), Ok(resource)) = (owner, Resource::new(fence.resource())) {
                 state
                     .core
-                    .owner_known(now, &resource, owner, Dialect::Own, actions);
+                    .owner_known(now, &resource, owner, LockDialect::Own, actions);
                 state.note(owner);
             }
             state.core.saw(now, fence, tell, actions);

@@ -11,7 +11,7 @@ use fipa::{AgentId, Gateway, Kind, Letter, Message, MessageBuilder};
 use fipa_mts::letter_for;
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Location, Parcel,
-    Sink, Stream, Transport as _, Verdict,
+    Reaction, Sink, Stream, Transport as _,
 };
 use fipa_transport_net::{Identity, TcpConfig, TcpTransport};
 use parking_lot::Mutex;
@@ -21,12 +21,12 @@ use parking_lot::Mutex;
 struct Inbox(Mutex<Vec<Message>>);
 
 impl Sink for Inbox {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         if let Body::Letter(letter) = arrival.parcel.body {
             let message = Message::decode(letter.payload()).unwrap();
             self.0.lock().push(message);
         }
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}

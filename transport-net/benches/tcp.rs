@@ -17,7 +17,7 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, LegacySource, Location,
-    Parcel, Sink, Stream, Transport, Verdict,
+    Parcel, Reaction, Sink, Stream, Transport,
 };
 use fipa_transport_net::{Identity, TcpConfig, TcpTransport};
 use parking_lot::Mutex;
@@ -36,9 +36,9 @@ const SIZES: [usize; 4] = [100, 1 << 10, 64 << 10, 1 << 20];
 struct Accepting(Mutex<Sender<Conclusion>>);
 
 impl Sink for Accepting {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         black_box(arrival);
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, letter: Letter, _: Kind, _: LegacySource) {

@@ -24,7 +24,7 @@ use fipa_acl::{
 };
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, LegacySource, Location,
-    Parcel, Sink, Stream, Transport as _, TransportErrorKind, Verdict,
+    Parcel, Reaction, Sink, Stream, Transport as _, TransportErrorKind,
 };
 use fipa_transport_net::{Identity, UdtConfig, UdtLimits, UdtTransport};
 use parking_lot::{Condvar, Mutex};
@@ -81,8 +81,8 @@ impl Counter {
 }
 
 impl Sink for Counter {
-    fn arrived(&self, _: Arrival) -> Verdict {
-        Verdict::Now(Answer::Accepted)
+    fn arrived(&self, _: Arrival) -> Reaction {
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {

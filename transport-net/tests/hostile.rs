@@ -15,7 +15,7 @@ use common::{Party, accepted, config, parcel, rogue_hello, written};
 use fipa_acl::Envelope;
 use fipa_testbed::{frame_header, until_some};
 use fipa_transport::{
-    Conclusion, Kind, Location, Parcel, Transport as _, TransportErrorKind, Verdict,
+    Conclusion, Kind, Location, Parcel, Reaction, Transport as _, TransportErrorKind,
 };
 use fipa_transport_net::{Counters, Limits};
 use socket2::{Domain, Socket, Type};
@@ -332,7 +332,7 @@ fn a_flooding_peer_is_closed_without_effect_on_others() {
     narrow.limits.max_in_flight = 64;
     // One side has as many unanswered parcels as allowed; the other answers, and its answers are
     // not read.
-    let late = Party::judging(narrow.clone(), Verdict::Later);
+    let late = Party::judging(narrow.clone(), Reaction::Later);
     let busy = Party::with(narrow);
     for party in [&late, &busy] {
         let mut stream = connect(party);

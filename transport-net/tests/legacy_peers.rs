@@ -17,7 +17,7 @@ use common::{Party, Threads, config, runtime};
 use fipa_acl::{Dialect, Envelope, Letter, Message, Performative, Representation};
 use fipa_testbed::until_some;
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Conclusion, Kind, LegacySource, Sink, Transport as _, Verdict,
+    Answer, Arrival, AttemptId, Conclusion, Kind, LegacySource, Reaction, Sink, Transport as _,
 };
 use fipa_transport_net::{Limits, TcpTransport};
 use parking_lot::{Condvar, Mutex};
@@ -64,8 +64,8 @@ impl Recorder {
 }
 
 impl Sink for Recorder {
-    fn arrived(&self, _: Arrival) -> Verdict {
-        Verdict::Now(Answer::Accepted)
+    fn arrived(&self, _: Arrival) -> Reaction {
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource) {

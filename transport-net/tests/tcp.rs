@@ -16,7 +16,7 @@ use fipa_acl::{ErrorChain, Letter};
 use fipa_testbed::{until, until_async, until_some};
 use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, ListenError, Location,
-    Transport, TransportErrorKind, Verdict,
+    Reaction, Transport, TransportErrorKind,
 };
 use fipa_transport_net::TcpTransport;
 
@@ -59,7 +59,7 @@ fn letters_that_are_sent_in_a_row_share_a_write() {
 #[test]
 fn late_answers_may_come_in_any_order() {
     let a = Party::new();
-    let b = Party::judging(config(&["127.0.0.1:0"]), Verdict::Later);
+    let b = Party::judging(config(&["127.0.0.1:0"]), Reaction::Later);
     for attempt in 0..100 {
         a.send(attempt, b.location(), parcel(attempt, "x")).unwrap();
     }
@@ -121,7 +121,7 @@ fn big_letters_and_letters_of_many_pieces_arrive_whole_among_small_ones() {
 
 #[test]
 fn one_connection_serves_both_directions_even_without_a_listener() {
-    let silent = Party::judging(config(&[]), Verdict::Now(Answer::Accepted));
+    let silent = Party::judging(config(&[]), Reaction::Now(Answer::Accepted));
     assert_eq!(silent.locations, []);
     let b = Party::new();
     silent.assert_reaches(1, &b);
@@ -223,7 +223,7 @@ fn a_connection_kept_open_by_an_unanswered_letter_is_kept_alive() {
     lively.limits.idle_close = Duration::from_millis(20);
     lively.limits.keep_alive = Duration::from_millis(200);
     let a = Party::with(lively);
-    let b = Party::judging(config(&["127.0.0.1:0"]), Verdict::Later);
+    let b = Party::judging(config(&["127.0.0.1:0"]), Reaction::Later);
     a.send(1, b.location(), parcel(1, "x")).unwrap();
     until_some("the arrival", || (b.arrivals() == 1).then_some(()));
     // Several times the time after which a silent peer is given up.

@@ -25,7 +25,7 @@ use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, LegacySource, Location,
-    Parcel, Sink, Stream, Transport, Verdict,
+    Parcel, Reaction, Sink, Stream, Transport,
 };
 use fipa_transport_shm::{ShmConfig, ShmTransport};
 use iceoryx2::pending_response::PendingResponse;
@@ -197,9 +197,9 @@ fn report(kinds: &mut [Measurement<'_>]) {
 struct Count(AtomicU64);
 
 impl Sink for Count {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         drop(black_box(arrival));
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: LegacySource) {}

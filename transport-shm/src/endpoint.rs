@@ -23,7 +23,7 @@ use crate::counters::{Tally, count};
 use crate::deferred::LateAnswers;
 use crate::domain_files::{DomainFiles, file_error};
 use crate::errors::{self, closed, opening};
-use crate::fork::Owner;
+use crate::fork::OwnerMark;
 use crate::inbox::{Inbox, mailbox_name};
 use crate::layout::Svc;
 use crate::loan::ShmLoan;
@@ -43,7 +43,7 @@ pub(crate) struct Endpoint {
     config: ShmConfig,
     /// The files by which other processes find this one.
     files: Vec<PathBuf>,
-    owner: Owner,
+    owner: OwnerMark,
     runtime: Handle,
     sink: OnceLock<Arc<dyn Sink>>,
     closed: AtomicBool,
@@ -184,7 +184,7 @@ impl Endpoint {
         &self.config
     }
 
-    pub(crate) fn owner(&self) -> Owner {
+    pub(crate) fn owner(&self) -> OwnerMark {
         self.owner
     }
 

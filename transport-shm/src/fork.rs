@@ -13,9 +13,9 @@ use crate::memory::{MappedPtr, PAGE};
 
 /// The process that created a value and that alone may use it. The check costs no system call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Owner(u64);
+pub struct OwnerMark(u64);
 
-impl Owner {
+impl OwnerMark {
     /// The running process.
     #[must_use]
     pub fn this() -> Self {

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal,
-    Sink, Ticket, Verdict,
+    Reaction, Sink, Ticket,
 };
 use iceoryx2::port::{DegradationAction, ReceiveError};
 use iceoryx2::prelude::{BackpressureStrategy, Node, PortFactory, ServiceName};
@@ -253,16 +253,16 @@ impl Inbox {
             && let Some(ticket) = ticket
         {
             match verdict {
-                Verdict::Now(_) => unanswered = deferred.take(ticket),
-                Verdict::Later => {
+                Reaction::Now(_) => unanswered = deferred.take(ticket),
+                Reaction::Later => {
                     count(&self.tally.deferred);
                     return None;
                 }
             }
         }
         let answer = match verdict {
-            Verdict::Now(answer) => answer,
-            Verdict::Later => Answer::failed(
+            Reaction::Now(answer) => answer,
+            Reaction::Later => Answer::failed(
                 FailureReason::Refused,
                 "the receiver deferred the answer to a parcel that must be answered at once",
             ),

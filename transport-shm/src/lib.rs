@@ -85,6 +85,6 @@ mod wakeup;
 pub use config::{ShmConfig, ShmError};
 pub use counters::ShmCounters;
 pub use domain_files::{Cleaned, cleanup_dead};
-pub use fork::Owner;
+pub use fork::OwnerMark;
 pub use inspect::{Inspection, inspect};
 pub use transport::ShmTransport;

@@ -24,7 +24,7 @@ use crate::errors::{
     allocating, create_error, loan_error, open_error, retired, send_error, too_large, window_full,
     wire_error,
 };
-use crate::fork::Owner;
+use crate::fork::OwnerMark;
 use crate::layout::{
     ALIGNMENT, Ack, Header, InitRequest, MailClient, Pending, PieceOffsets, Response, Svc,
     UninitRequest, answer_of,
@@ -552,7 +552,7 @@ impl Outbox {
         state.loans.push((loan.address(), Arc::downgrade(loan)));
     }
 
-    pub(crate) fn owner(&self) -> Owner {
+    pub(crate) fn owner(&self) -> OwnerMark {
         self.domain.owner()
     }
 

@@ -8,7 +8,7 @@ use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 
 use crate::domain_files::DomainFiles;
-use crate::fork::Owner;
+use crate::fork::OwnerMark;
 use crate::segment::{ContentReference, SegmentFile};
 
 /// Maximum number of segments kept open.
@@ -99,7 +99,7 @@ impl PeerSegments {
         Ok(segment)
     }
 
-    pub(crate) fn owner(&self) -> Owner {
+    pub(crate) fn owner(&self) -> OwnerMark {
         self.domain.owner()
     }
 

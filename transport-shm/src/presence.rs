@@ -29,7 +29,7 @@ use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use crate::answer_words::{AnswerWords, LentWords, WordPlace};
-use crate::fork::Owner;
+use crate::fork::OwnerMark;
 use crate::memory::{Mapping, PAGE, is_owned, open_owned};
 use crate::paths::{CONTENT, ProcessPaths};
 use crate::segment;
@@ -107,7 +107,7 @@ pub(crate) fn remove_file(path: &Path) {
 pub(crate) struct Presence {
     paths: ProcessPaths,
     own: Incarnation,
-    owner: Owner,
+    owner: OwnerMark,
     doorbell: Arc<Doorbell>,
     page: Arc<StatusPage>,
     lender: Arc<WordLender>,
@@ -154,7 +154,7 @@ impl Presence {
         Ok(Self {
             paths: paths.clone(),
             own,
-            owner: Owner::this(),
+            owner: OwnerMark::this(),
             doorbell: Arc::new(Doorbell(doorbell)),
             lender: Arc::new(WordLender::new(Arc::clone(&mapped), [number?, token?])),
             page: mapped,

@@ -12,7 +12,7 @@ use common::{RecordingSink, TestDomain, attempt, parcel};
 use fipa_acl::Letter;
 use fipa_testbed::until;
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Conclusion, Kind, LegacySource, Sink, Ticket, Transport, Verdict,
+    Answer, Arrival, AttemptId, Conclusion, Kind, LegacySource, Reaction, Sink, Ticket, Transport,
 };
 use fipa_transport_shm::ShmTransport;
 
@@ -27,11 +27,11 @@ impl DeferringSink {
 }
 
 impl Sink for DeferringSink {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         self.0.lock().unwrap().push(arrival.ticket);
         match arrival.ticket {
-            Some(_) => Verdict::Later,
-            None => Verdict::Now(Answer::Custody),
+            Some(_) => Reaction::Later,
+            None => Reaction::Now(Answer::Custody),
         }
     }
 

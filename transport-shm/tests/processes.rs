@@ -17,8 +17,8 @@ use common::{GatedSink, RecordingSink, TestDomain, attempt, location_of, mapping
 use fipa_acl::Letter;
 use fipa_testbed::{ChildGuard, ignored_test, until};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Conclusion, Incarnation, Kind, LegacySource, Sink, Transport,
-    TransportErrorKind, Verdict,
+    Answer, Arrival, AttemptId, Conclusion, Incarnation, Kind, LegacySource, Reaction, Sink,
+    Transport, TransportErrorKind,
 };
 use fipa_transport_shm::{ShmConfig, ShmTransport, cleanup_dead};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -264,7 +264,7 @@ fn attempts_to_a_killed_receiver_are_concluded() {
 struct HaltingSink;
 
 impl Sink for HaltingSink {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         if let fipa_transport::Body::Letter(letter) = &arrival.parcel.body
             && !letter.payload().content.is_empty()
         {
@@ -273,7 +273,7 @@ impl Sink for HaltingSink {
                 std::thread::park();
             }
         }
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}

@@ -12,8 +12,8 @@ use common::{GatedSink, RecordingSink, TestDomain, attempt, open, parcel};
 use fipa_acl::Letter;
 use fipa_testbed::until;
 use fipa_transport::{
-    Abandoned, Answer, Arrival, AttemptId, Conclusion, FailureReason, Kind, LegacySource, Sink,
-    Transport, Verdict,
+    Abandoned, Answer, Arrival, AttemptId, Conclusion, FailureReason, Kind, LegacySource, Reaction,
+    Sink, Transport,
 };
 use fipa_transport_shm::ShmTransport;
 
@@ -70,9 +70,9 @@ impl AnsweringSink {
 }
 
 impl Sink for AnsweringSink {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         self.held.lock().unwrap().push(arrival);
-        Verdict::Now(self.answer.lock().unwrap().clone())
+        Reaction::Now(self.answer.lock().unwrap().clone())
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}

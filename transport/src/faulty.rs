@@ -12,8 +12,8 @@ use parking_lot::Mutex;
 use crate::transport::LoanedContent;
 use crate::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Introduction, Kind, LegacySource,
-    ListenError, Location, Parcel, Sink, Ticket, Transport, TransportError, TransportErrorKind,
-    Verdict,
+    ListenError, Location, Parcel, Reaction, Sink, Ticket, Transport, TransportError,
+    TransportErrorKind,
 };
 
 /// A kind of fault.
@@ -232,7 +232,7 @@ struct Filter {
 }
 
 impl Sink for Filter {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         self.sink.arrived(arrival)
     }
 

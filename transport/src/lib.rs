@@ -45,5 +45,5 @@ pub use quota_address::{quota_address, scoped_quota_address};
 pub use token_bucket::TokenBucket;
 pub use transport::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, LegacySource,
-    LoanedContent, Mandate, Sink, Ticket, Transport, Verdict,
+    LoanedContent, Mandate, Reaction, Sink, Ticket, Transport,
 };

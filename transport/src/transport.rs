@@ -64,7 +64,7 @@ pub trait Transport: Send + Sync + 'static {
     /// Returns [`Abandoned::Unconfirmed`] for an unknown attempt.
     fn abandon(&self, attempt: AttemptId, to: &Location) -> Abandoned;
 
-    /// Answers an arrival for which the sink returned [`Verdict::Later`]. Unknown tickets are
+    /// Answers an arrival for which the sink returned [`Reaction::Later`]. Unknown tickets are
     /// ignored, because the peer may have disconnected.
     fn answer(&self, ticket: Ticket, answer: Answer);
 
@@ -144,7 +144,7 @@ pub struct LegacySource {
 /// The receiver of arrivals and conclusions: the delivery core.
 pub trait Sink: Send + Sync {
     /// Handles a parcel that arrived. The verdict determines the answer to the sender.
-    fn arrived(&self, arrival: Arrival) -> Verdict;
+    fn arrived(&self, arrival: Arrival) -> Reaction;
 
     /// Handles a letter of a legacy peer, which has no parcel header and gets no answer. The
     /// transport has converted its envelope to the standard dialect; the envelope names the
@@ -272,7 +272,7 @@ pub struct Arrival {
     pub parcel: Parcel,
     /// The service that handed it over.
     pub from: Hop,
-    /// Identifies the arrival in [`Transport::answer`] after [`Verdict::Later`]. `None` if the sink
+    /// Identifies the arrival in [`Transport::answer`] after [`Reaction::Later`]. `None` if the sink
     /// must answer at once, because the arrival occupies a slot that the transport needs. A delivery
     /// core that does not have the outcome yet then answers [`Answer::Custody`] and sends a report
     /// later.
@@ -314,7 +314,7 @@ impl Hop {
 
 /// A sink's reaction to an arrival.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Verdict {
+pub enum Reaction {
     /// Answers at once.
     Now(Answer),
     /// Answers later through [`Transport::answer`]. Not allowed for an arrival without a

@@ -9,8 +9,8 @@ use std::time::Duration;
 use fipa_transport::conformance::{Fixture, KeyedEndpoint};
 use fipa_transport::{
     Abandoned, Answer, Arrival, AttemptId, Conclusion, Faulty, Hop, Incarnation, Kind, ListenError,
-    Location, Parcel, Principal, Sink, Ticket, Transport, TransportError, TransportErrorKind,
-    Verdict, wire,
+    Location, Parcel, Principal, Reaction, Sink, Ticket, Transport, TransportError,
+    TransportErrorKind, wire,
 };
 use parking_lot::Mutex;
 
@@ -143,7 +143,7 @@ impl Transport for TableTransport {
                     location: sender.location.clone(),
                     principal: Principal::Host,
                 };
-                if let Verdict::Now(answer) = sink.arrived(Arrival {
+                if let Reaction::Now(answer) = sink.arrived(Arrival {
                     parcel,
                     from,
                     ticket: Some(ticket),
@@ -244,9 +244,9 @@ mod faults {
     }
 
     impl Sink for RecordingSink {
-        fn arrived(&self, _: Arrival) -> Verdict {
+        fn arrived(&self, _: Arrival) -> Reaction {
             *self.arrived.lock() += 1;
-            Verdict::Now(Answer::Accepted)
+            Reaction::Now(Answer::Accepted)
         }
 
         fn arrived_unframed(&self, _: fipa_acl::Letter, _: Kind, _: fipa_transport::LegacySource) {}

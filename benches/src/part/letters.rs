@@ -10,7 +10,7 @@ use fipa::Config;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, LegacySource, Location,
-    Parcel, Sink, Stream, Transport, Verdict,
+    Parcel, Reaction, Sink, Stream, Transport,
 };
 use fipa_transport_shm::ShmTransport;
 use parking_lot::Mutex;
@@ -67,12 +67,12 @@ struct ReceivedLetters {
 }
 
 impl Sink for ReceivedLetters {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         if let Body::Letter(letter) = &arrival.parcel.body {
             let seen = ContentProbe::of(&letter.payload().content);
             self.arrived.lock().push((now_ns(), seen));
         }
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: LegacySource) {}

@@ -1,7 +1,7 @@
 //! `fipa doctor`: checks this machine.
 
 use clap::Args;
-use fipa::admin::doctor::{Check, Verdict, examine, examine_gateway};
+use fipa::admin::doctor::{Check, Severity, examine, examine_gateway};
 use fipa::{Config, Domain};
 use fipa_acl::escape;
 use serde_json::json;
@@ -48,16 +48,16 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let mut checks = examine(&config);
     checks.extend(of_gateway(&config));
     let worst = checks.iter().map(|check| check.verdict).max();
-    let worst = worst.unwrap_or(Verdict::Fine);
+    let worst = worst.unwrap_or(Severity::Fine);
     if arguments.json {
         output::json(&json!({ "verdict": worst, "checks": checks }))?;
     } else {
         output::text(&table(&checks))?;
     }
-    if worst < Verdict::Bad {
+    if worst < Severity::Bad {
         return Ok(());
     }
-    let bad = checks.iter().filter(|check| check.verdict == Verdict::Bad);
+    let bad = checks.iter().filter(|check| check.verdict == Severity::Bad);
     let bad: Vec<String> = bad
         .map(|check| format!("{}: {}", check.area, check.check))
         .collect();
@@ -103,10 +103,10 @@ fn table(checks: &[Check]) -> String {
     format!("{}\n", table.trim_fmt())
 }
 
-fn word(verdict: Verdict) -> &'static str {
+fn word(verdict: Severity) -> &'static str {
     match verdict {
-        Verdict::Fine => "fine",
-        Verdict::Doubtful => "doubtful",
+        Severity::Fine => "fine",
+        Severity::Warning => "doubtful",
         _ => "bad",
     }
 }

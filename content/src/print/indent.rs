@@ -1,6 +1,6 @@
 //! Line breaks and indentation, added to SL text on one line.
 
-use crate::Dialect;
+use crate::SlDialect;
 use crate::lex::{Lexer, Token};
 
 /// Maximum length of a list on one line, in bytes.
@@ -77,7 +77,7 @@ fn columns(depth: usize) -> usize {
 /// Returns the tokens. An opening parenthesis has the offset at which its list ends.
 fn spans(line: &[u8]) -> Vec<Span> {
     // Only the extent of byte strings matters, which the standard's rules give in every dialect.
-    let mut lexer = Lexer::new(line, Dialect::Standard);
+    let mut lexer = Lexer::new(line, SlDialect::Standard);
     let mut spans: Vec<Span> = Vec::new();
     let mut open = Vec::new();
     loop {

@@ -12,7 +12,7 @@ use crate::term::{
     ActionExpression, Arguments, FunctionalTerm, IdentifyingExpression, Parameter, Term,
 };
 use crate::wff::Wff;
-use crate::{Dialect, MAX_DEPTH, write};
+use crate::{MAX_DEPTH, SlDialect, write};
 
 /// Writes contents, formulas and terms.
 ///
@@ -21,16 +21,16 @@ use crate::{Dialect, MAX_DEPTH, write};
 /// a proposition.
 ///
 /// ```
-/// use fipa_content::{Content, Dialect, Printer};
+/// use fipa_content::{Content, SlDialect, Printer};
 ///
 /// let content = Content::parse("( (done(action crex (dock))) )")?;
-/// let text = Printer::new().dialect(Dialect::Jade).print(&content)?;
+/// let text = Printer::new().dialect(SlDialect::Jade).print(&content)?;
 /// assert_eq!(text, b"((done (action crex (dock))))");
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Printer {
-    dialect: Dialect,
+    dialect: SlDialect,
     layout: Layout,
 }
 
@@ -51,7 +51,7 @@ impl Printer {
 
     /// Writes in this dialect.
     #[must_use]
-    pub fn dialect(self, dialect: Dialect) -> Self {
+    pub fn dialect(self, dialect: SlDialect) -> Self {
         Self { dialect, ..self }
     }
 
@@ -69,7 +69,7 @@ impl Printer {
     #[must_use]
     pub fn jade_failure(self) -> Self {
         Self {
-            dialect: Dialect::Jade,
+            dialect: SlDialect::Jade,
             layout: Layout::JadeFailure,
         }
     }
@@ -232,7 +232,7 @@ impl sealed::Print for Content<'_> {
         }
         first.print(writer)?;
         writer.each(others.iter().map(|one| one as &dyn sealed::Print))?;
-        let several = writer.printer.dialect == Dialect::Jade && !others.is_empty();
+        let several = writer.printer.dialect == SlDialect::Jade && !others.is_empty();
         if several || writer.is_jade_failure() {
             // JADE writes a blank after each of several expressions.
             writer.put(" ");

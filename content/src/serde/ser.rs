@@ -10,7 +10,7 @@ use super::names;
 use crate::error::PrintError;
 use crate::parse::Parser;
 use crate::print::Printer;
-use crate::{Dialect, MAX_DEPTH, write};
+use crate::{MAX_DEPTH, SlDialect, write};
 
 type Result<T = ()> = std::result::Result<T, Boxed>;
 
@@ -38,7 +38,7 @@ impl<E: Into<SerializeError>> From<E> for Boxed {
 /// # Errors
 /// When SL has no notation for a part of the value, or `Serialize` of the value fails.
 pub fn to_vec(value: &(impl Serialize + ?Sized)) -> std::result::Result<Vec<u8>, SerializeError> {
-    to_vec_in(Dialect::Standard, value)
+    to_vec_in(SlDialect::Standard, value)
 }
 
 /// Writes the value as a term in this dialect.
@@ -46,7 +46,7 @@ pub fn to_vec(value: &(impl Serialize + ?Sized)) -> std::result::Result<Vec<u8>,
 /// # Errors
 /// When the dialect has no notation for a part of the value, or `Serialize` of the value fails.
 pub fn to_vec_in(
-    dialect: Dialect,
+    dialect: SlDialect,
     value: &(impl Serialize + ?Sized),
 ) -> std::result::Result<Vec<u8>, SerializeError> {
     let mut serializer = Serializer {
@@ -68,7 +68,7 @@ pub fn to_vec_in(
 
 struct Serializer {
     out: Vec<u8>,
-    dialect: Dialect,
+    dialect: SlDialect,
     depth: usize,
     mode: Mode,
     /// Whether the last value was `None`, and nothing was written.
@@ -147,8 +147,8 @@ impl Serializer {
 
     /// Appends the text of a term within the remaining depth.
     fn term(&mut self, text: &[u8]) -> Result {
-        let term = Parser::whole_at(self.depth, Dialect::Standard, text, Parser::term)?;
-        if self.dialect == Dialect::Standard {
+        let term = Parser::whole_at(self.depth, SlDialect::Standard, text, Parser::term)?;
+        if self.dialect == SlDialect::Standard {
             self.out.extend_from_slice(text);
         } else {
             let text = Printer::new().dialect(self.dialect).print(&term)?;
@@ -179,7 +179,7 @@ macro_rules! long_integers {
     ($($method:ident $integer:ty,)*) => {$(
         #[inline]
         fn $method(self, value: $integer) -> Result {
-            if self.dialect == Dialect::Jade && i64::try_from(value).is_err() {
+            if self.dialect == SlDialect::Jade && i64::try_from(value).is_err() {
                 return Err(too_large_for_jade().into());
             }
             self.put(itoa::Buffer::new().format(value));

@@ -4,12 +4,12 @@
 use std::collections::BTreeMap;
 
 use fipa_content::{
-    Content, Dialect, PrintError, Printer, Profile, Query, Term, Wff, from_slice_in, to_vec_in,
+    Content, PrintError, Printer, Profile, Query, SlDialect, Term, Wff, from_slice_in, to_vec_in,
 };
 use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 
-pub(crate) const DIALECTS: [Dialect; 2] = [Dialect::Standard, Dialect::Jade];
+pub(crate) const DIALECTS: [SlDialect; 2] = [SlDialect::Standard, SlDialect::Jade];
 
 /// Reads the bytes as each kind of expression and as values.
 pub(crate) fn are_read_or_refused(bytes: &[u8]) {
@@ -27,7 +27,7 @@ pub(crate) fn are_read_or_refused(bytes: &[u8]) {
             (Ok(term), Ok(read)) => {
                 // The deserializer passes terms in the standard notation, in which a byte string of
                 // JADE that is UTF-8 becomes text.
-                if dialect == Dialect::Standard {
+                if dialect == SlDialect::Standard {
                     assert_eq!(term, read);
                 }
                 from_slice_in::<IgnoredAny>(dialect, bytes).expect("a term can be ignored");
@@ -46,16 +46,16 @@ pub(crate) fn are_read_or_refused(bytes: &[u8]) {
 
 /// Checks that the content is the same after printing and parsing, in every layout and in every
 /// dialect that has a notation for it.
-pub(crate) fn survives(content: &Content<'_>, dialect: Dialect) {
+pub(crate) fn survives(content: &Content<'_>, dialect: SlDialect) {
     let printer = Printer::new().dialect(dialect);
     let mut layouts = vec![printer, printer.indented()];
-    if dialect == Dialect::Jade {
+    if dialect == SlDialect::Jade {
         layouts.push(printer.jade_failure());
     }
     for printer in layouts {
         match printer.print(content) {
             Ok(text) => assert_eq!(Content::parse_in(dialect, &text).as_ref(), Ok(content)),
-            Err(PrintError::Unrepresentable { .. }) if dialect == Dialect::Jade => {}
+            Err(PrintError::Unrepresentable { .. }) if dialect == SlDialect::Jade => {}
             Err(error) => panic!("{dialect}: {error}"),
         }
     }

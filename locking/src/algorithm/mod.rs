@@ -13,7 +13,7 @@ pub use ricart_agrawala::RicartAgrawala;
 pub use suzuki_kasami::SuzukiKasami;
 
 use crate::faults::Fault;
-use crate::{Act, Conversation, Dialect, Millis, Peer};
+use crate::{Act, Conversation, LockDialect, Millis, Peer};
 
 /// The algorithms. All agents that use a resource use the one that its owner names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
@@ -21,7 +21,7 @@ use crate::{Act, Conversation, Dialect, Millis, Peer};
     clippy::exhaustive_enums,
     reason = "the owner's queue, and the protocols of distributed_locking"
 )]
-pub enum Kind {
+pub enum Algorithm {
     /// The owner serves requests in the order of their arrival. Agents of `distributed_locking` cannot take
     /// part.
     #[default]
@@ -38,7 +38,7 @@ pub enum Kind {
     SuzukiKasamiExtended,
 }
 
-impl Kind {
+impl Algorithm {
     /// All algorithms.
     pub const ALL: [Self; 5] = [
         Self::OwnerQueue,
@@ -89,7 +89,7 @@ impl Kind {
     }
 }
 
-impl fmt::Display for Kind {
+impl fmt::Display for Algorithm {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.protocol())
     }
@@ -113,10 +113,10 @@ pub enum Gate {
 impl Gate {
     /// Whether an agent may pass.
     #[must_use]
-    pub fn lets_pass(self, dialect: Dialect) -> bool {
+    pub fn lets_pass(self, dialect: LockDialect) -> bool {
         match self {
             Self::Open => true,
-            Self::Own => dialect == Dialect::Own,
+            Self::Own => dialect == LockDialect::Own,
             Self::Closed => false,
         }
     }
@@ -126,7 +126,7 @@ impl Gate {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Member {
     /// Implementation of the member.
-    pub dialect: Dialect,
+    pub dialect: LockDialect,
     /// Whether it has not answered the last probes. Requests do not wait for it.
     pub suspected: bool,
 }
@@ -152,16 +152,16 @@ pub struct Context<'a> {
 }
 
 impl Context<'_> {
-    fn dialect(&self, peer: &Peer) -> Dialect {
+    fn dialect(&self, peer: &Peer) -> LockDialect {
         self.members
             .get(peer)
-            .map_or(Dialect::Legacy, |member| member.dialect)
+            .map_or(LockDialect::Legacy, |member| member.dialect)
     }
 
     /// Whether a request to an agent is repeated. Agents of `distributed_locking` treat a second request
     /// in a conversation as an error; their letters are not lost while they run.
     fn accepts_repetition(&self, peer: &Peer) -> bool {
-        self.dialect(peer) == Dialect::Own
+        self.dialect(peer) == LockDialect::Own
     }
 }
 
@@ -190,11 +190,11 @@ pub enum Step {
 /// A distributed algorithm at one agent, for one resource.
 ///
 /// An agent has at most one open request: from [`request`](Self::request) to [`leave`](Self::leave).
-pub trait Algorithm: Clone + Eq + Hash + fmt::Debug {
+pub trait MutualExclusion: Clone + Eq + Hash + fmt::Debug {
     /// Creates the state of an agent that has neither sent nor received a message.
     ///
     /// `owns` is whether the agent owns the resource: it then has the token.
-    fn new(kind: Kind, me: Peer, owns: bool) -> Self;
+    fn new(kind: Algorithm, me: Peer, owns: bool) -> Self;
 
     /// Begins a request.
     fn request(&mut self, context: &Context<'_>, conversation: &Conversation, out: &mut Vec<Step>);
@@ -284,14 +284,14 @@ macro_rules! either {
     };
 }
 
-impl Algorithm for AnyAlgorithm {
-    fn new(kind: Kind, me: Peer, owns: bool) -> Self {
+impl MutualExclusion for AnyAlgorithm {
+    fn new(kind: Algorithm, me: Peer, owns: bool) -> Self {
         match kind {
-            Kind::OwnerQueue => Self::OwnerQueue(OwnerQueue::new(kind, me, owns)),
-            Kind::SuzukiKasami | Kind::SuzukiKasamiExtended => {
+            Algorithm::OwnerQueue => Self::OwnerQueue(OwnerQueue::new(kind, me, owns)),
+            Algorithm::SuzukiKasami | Algorithm::SuzukiKasamiExtended => {
                 Self::SuzukiKasami(SuzukiKasami::new(kind, me, owns))
             }
-            Kind::RicartAgrawala | Kind::RicartAgrawalaExtended => {
+            Algorithm::RicartAgrawala | Algorithm::RicartAgrawalaExtended => {
                 Self::RicartAgrawala(RicartAgrawala::new(kind, me, owns))
             }
         }

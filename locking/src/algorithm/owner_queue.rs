@@ -5,7 +5,7 @@
 
 use std::collections::BTreeSet;
 
-use super::{Algorithm, Context, Kind, Step};
+use super::{Algorithm, Context, MutualExclusion, Step};
 use crate::{Act, Conversation, Millis, Peer};
 
 /// State of one agent for one resource.
@@ -15,8 +15,8 @@ pub struct OwnerQueue {
     place: Option<u32>,
 }
 
-impl Algorithm for OwnerQueue {
-    fn new(_: Kind, _: Peer, _: bool) -> Self {
+impl MutualExclusion for OwnerQueue {
+    fn new(_: Algorithm, _: Peer, _: bool) -> Self {
         Self {
             own: None,
             place: None,

@@ -13,9 +13,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{Algorithm, Context, Kind, Step};
+use super::{Algorithm, Context, MutualExclusion, Step};
 use crate::faults::fault;
-use crate::{Act, Conversation, Dialect, Gate, Millis, Peer};
+use crate::{Act, Conversation, Gate, LockDialect, Millis, Peer};
 
 /// Maximum clock: `distributed_locking` reads a 32-bit integer. Clocks that have reached it are equal,
 /// and the order is that of the agents.
@@ -84,7 +84,7 @@ impl RicartAgrawala {
             !own.entered && own.clock < MAX_CLOCK && clock >= least
         });
         is_later
-            && context.dialect(from) == Dialect::Legacy
+            && context.dialect(from) == LockDialect::Legacy
             && !self.acquainted.contains(from)
             && !fault!(context.fault, TrustStranger)
     }
@@ -118,8 +118,8 @@ impl RicartAgrawala {
     }
 }
 
-impl Algorithm for RicartAgrawala {
-    fn new(kind: Kind, me: Peer, _: bool) -> Self {
+impl MutualExclusion for RicartAgrawala {
+    fn new(kind: Algorithm, me: Peer, _: bool) -> Self {
         Self {
             me,
             extended: kind.is_extended(),
@@ -172,7 +172,7 @@ impl Algorithm for RicartAgrawala {
                 if fault!(context.fault, Foreign) {
                     self.clock += 2;
                 }
-                if context.dialect(from) == Dialect::Legacy {
+                if context.dialect(from) == LockDialect::Legacy {
                     self.acquainted.insert(from.clone());
                 }
                 let known = self.deferred.get(from);

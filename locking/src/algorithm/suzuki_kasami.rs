@@ -19,9 +19,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use super::{Algorithm, Context, Kind, Step};
+use super::{Algorithm, Context, MutualExclusion, Step};
 use crate::faults::fault;
-use crate::{Act, Conversation, Dialect, Gate, Millis, Peer, Token};
+use crate::{Act, Conversation, Gate, LockDialect, Millis, Peer, Token};
 
 /// Maximum number of a request: `distributed_locking` reads a 32-bit integer.
 const MAX_NUMBER: u64 = i32::MAX as u64;
@@ -244,7 +244,7 @@ impl SuzukiKasami {
             return;
         };
         token.generation = Some(self.generation);
-        let legacy = |peer: &Peer| context.dialect(peer) == Dialect::Legacy;
+        let legacy = |peer: &Peer| context.dialect(peer) == LockDialect::Legacy;
         let archive = context.members.keys().any(legacy) || legacy(&to);
         token.archive = archive.then(|| self.archive.unwrap_or(Token::ARCHIVE));
         let request = self.requests.get(to.shared_name());
@@ -354,7 +354,7 @@ impl SuzukiKasami {
         }
         self.token = Some(token);
         let owner = context.owner.filter(|owner| **owner != self.me);
-        let of_legacy = owner.is_some_and(|owner| context.dialect(owner) == Dialect::Legacy);
+        let of_legacy = owner.is_some_and(|owner| context.dialect(owner) == LockDialect::Legacy);
         self.arrived = (self.extended && of_legacy).then(|| conversation.clone());
         if !returned {
             self.enter(out);
@@ -371,8 +371,8 @@ impl Token {
     const ARCHIVE: u16 = 18;
 }
 
-impl Algorithm for SuzukiKasami {
-    fn new(kind: Kind, me: Peer, owns: bool) -> Self {
+impl MutualExclusion for SuzukiKasami {
+    fn new(kind: Algorithm, me: Peer, owns: bool) -> Self {
         Self {
             me,
             extended: kind.is_extended(),

@@ -37,8 +37,8 @@ use std::sync::Arc;
 use fipa_acl::{AgentId, BuildError, Message, Performative};
 
 use crate::{
-    Act, Content, Conversation, Dialect, FenceError, Kind, LockMessage, MAX_NAME, MAX_PLACE,
-    Millis, NameError, Refusal, Resource, Token,
+    Act, Algorithm, Content, Conversation, FenceError, LockDialect, LockMessage, MAX_NAME,
+    MAX_PLACE, Millis, NameError, Refusal, Resource, Token,
 };
 
 /// Ontology of the messages of this library.
@@ -77,7 +77,7 @@ const CLAIM: &str = "claim";
 pub enum DecodeError {
     /// The protocol is not one of locks, or not the one of this group.
     #[error("the protocol is not {DISCOVER}, {PROBE}, {FENCES} or {0}")]
-    Protocol(Kind),
+    Protocol(Algorithm),
     /// The protocol has no such message.
     #[error("the protocol has no message with performative {0}")]
     Performative(String),
@@ -121,7 +121,7 @@ pub enum DecodeError {
 /// A name cannot be encoded in an ACL message.
 pub fn encode(
     message: &LockMessage,
-    kind: Kind,
+    kind: Algorithm,
     sender: &AgentId,
     receiver: &AgentId,
 ) -> Result<Message, BuildError> {
@@ -133,7 +133,7 @@ pub fn encode(
         .protocol(protocol)
         .conversation_id(message.conversation.to_string())
         .content(content);
-    if message.dialect == Dialect::Own {
+    if message.dialect == LockDialect::Own {
         builder = builder.ontology(ONTOLOGY);
     }
     if let Content::Lock { act, .. } = &message.content {
@@ -160,7 +160,7 @@ pub fn encode(
     builder.build()
 }
 
-fn parts(message: &LockMessage, kind: Kind) -> (Performative, &'static str, String) {
+fn parts(message: &LockMessage, kind: Algorithm) -> (Performative, &'static str, String) {
     let (resource, act) = match &message.content {
         Content::Probe => return (Performative::Request, PROBE, String::new()),
         Content::Alive => return (Performative::Confirm, PROBE, String::new()),
@@ -225,7 +225,7 @@ fn parts(message: &LockMessage, kind: Kind) -> (Performative, &'static str, Stri
 /// Whether a message with this protocol is one of locks, in any algorithm.
 #[must_use]
 pub fn is_lock_protocol(protocol: &str) -> bool {
-    let mut kinds = Kind::ALL.iter().map(|kind| kind.protocol());
+    let mut kinds = Algorithm::ALL.iter().map(|kind| kind.protocol());
     [DISCOVER, PROBE, FENCES].contains(&protocol) || kinds.any(|name| name == protocol)
 }
 
@@ -234,30 +234,30 @@ pub fn is_lock_protocol(protocol: &str) -> bool {
 /// # Errors
 /// The message is not a message of locks.
 pub fn read(message: &Message) -> Result<LockMessage, DecodeError> {
-    let kind = message.protocol().and_then(Kind::named);
+    let kind = message.protocol().and_then(Algorithm::named);
     decode(message, kind.unwrap_or_default())
 }
 
 /// Returns the algorithm that a message of discovery names.
-fn named(message: &Message) -> Option<Kind> {
+fn named(message: &Message) -> Option<Algorithm> {
     let mut parameters = message.user_defined().iter();
     let (_, value) = parameters.find(|(name, _)| name.eq_ignore_ascii_case(ALGORITHM))?;
-    Kind::named(value)
+    Algorithm::named(value)
 }
 
 /// Reads a message of an agent of a group that uses `kind`.
 ///
 /// # Errors
 /// The message is not a message of locks.
-pub fn decode(message: &Message, kind: Kind) -> Result<LockMessage, DecodeError> {
+pub fn decode(message: &Message, kind: Algorithm) -> Result<LockMessage, DecodeError> {
     let protocol = message.protocol().ok_or(DecodeError::Protocol(kind))?;
     let conversation = message
         .conversation_id()
         .map(Conversation::parse)
         .ok_or(DecodeError::NoConversation)?;
     let dialect = match message.ontology() {
-        Some(ONTOLOGY) => Dialect::Own,
-        _ => Dialect::Legacy,
+        Some(ONTOLOGY) => LockDialect::Own,
+        _ => LockDialect::Legacy,
     };
     let content = message
         .content()
@@ -321,8 +321,8 @@ pub fn decode(message: &Message, kind: Kind) -> Result<LockMessage, DecodeError>
 fn algorithm(
     message: &Message,
     text: &str,
-    kind: Kind,
-    dialect: Dialect,
+    kind: Algorithm,
+    dialect: LockDialect,
 ) -> Result<Option<(Resource, Act)>, DecodeError> {
     if *message.performative() == Performative::Propagate && kind.has_token() {
         let (resource, token) = match message.language() {
@@ -350,7 +350,7 @@ fn algorithm(
         _ => Err(DecodeError::Number("the place")),
     };
     let (resource, act) = match (message.performative(), kind.has_token()) {
-        (Performative::Request, _) if kind == Kind::OwnerQueue => {
+        (Performative::Request, _) if kind == Algorithm::OwnerQueue => {
             let (Some(resource), former, None, None) = lines else {
                 return Err(parts());
             };
@@ -358,7 +358,7 @@ fn algorithm(
             let place = former.map(place).transpose()?;
             (resource, Act::Ask { asked, place })
         }
-        (Performative::Agree, _) if kind == Kind::OwnerQueue => {
+        (Performative::Agree, _) if kind == Algorithm::OwnerQueue => {
             let (Some(resource), Some(text), None, None) = lines else {
                 return Err(parts());
             };
@@ -366,7 +366,7 @@ fn algorithm(
             (resource, Act::Place { place })
         }
         // The request is the report.
-        (Performative::Confirm, _) if kind == Kind::OwnerQueue && lines.1.is_none() => {
+        (Performative::Confirm, _) if kind == Algorithm::OwnerQueue && lines.1.is_none() => {
             return Ok(None);
         }
         (Performative::Request, false) | (Performative::Agree, false) => {
@@ -390,8 +390,8 @@ fn algorithm(
         (Performative::Confirm, _) => match lines {
             (Some(resource), None, None, None) => {
                 let asked = match dialect {
-                    Dialect::Own => Some(time("reply-with", message.reply_with())?),
-                    Dialect::Legacy => None,
+                    LockDialect::Own => Some(time("reply-with", message.reply_with())?),
+                    LockDialect::Legacy => None,
                 };
                 (resource, Act::Confirm { asked })
             }

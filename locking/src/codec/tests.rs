@@ -38,8 +38,8 @@ fn recorded_messages_of_distributed_locking() {
                      6 agent3 1 0 0 1 0 6 agent3";
     let archive_3 = "22 serialization::archive 18 3 rsc 0 0 0 0 3 0 0 0 0 0 6 agent1 1 6 agent2 1 \
                      6 agent3 1 0 0 0 0";
-    let basic = Kind::RicartAgrawala;
-    let token = Kind::SuzukiKasami;
+    let basic = Algorithm::RicartAgrawala;
+    let token = Algorithm::SuzukiKasami;
     for (kind, performative, protocol, conversation, language, content) in [
         (basic, QueryIf, "dlm_discover", "agent2_0", "", "rsc"),
         (basic, Inform, "dlm_discover", "agent2_0", "", "rsc"),
@@ -84,7 +84,7 @@ fn recorded_messages_of_distributed_locking() {
     ] {
         let message = recorded(performative, protocol, conversation, language, content);
         let read = decode(&message, kind).unwrap();
-        assert_eq!(read.dialect, Dialect::Legacy);
+        assert_eq!(read.dialect, LockDialect::Legacy);
         let written = encode(&read, kind, &id("agent2"), &id("agent1")).unwrap();
         assert_eq!(written, message);
     }
@@ -114,7 +114,7 @@ fn recorded_messages_of_distributed_locking() {
 /// The owner's queue, in the form of its messages.
 #[test]
 fn messages_of_the_owner_s_queue() {
-    let kind = Kind::OwnerQueue;
+    let kind = Algorithm::OwnerQueue;
     let decoded = |performative, content: &str, reply_with: Option<&str>| {
         let mut builder = Message::builder(performative)
             .protocol("owner_queue")
@@ -151,17 +151,17 @@ fn messages_of_the_owner_s_queue() {
 /// An owner names the algorithm, except to agents of `distributed_locking`, which know no such parameter.
 #[test]
 fn an_owner_names_its_algorithm() {
-    for algorithm in Kind::ALL.map(Some).into_iter().chain([None]) {
+    for algorithm in Algorithm::ALL.map(Some).into_iter().chain([None]) {
         let message = LockMessage {
             conversation: Conversation::parse("agent1_0"),
-            dialect: Dialect::Own,
+            dialect: LockDialect::Own,
             algorithm,
             content: Content::Lock {
                 resource: Resource::new("bay").unwrap(),
                 act: Act::Owned,
             },
         };
-        let written = encode(&message, Kind::default(), &id("a"), &id("b")).unwrap();
+        let written = encode(&message, Algorithm::default(), &id("a"), &id("b")).unwrap();
         let named = algorithm.map(|kind| ("fipa-algorithm".to_owned(), kind.protocol().to_owned()));
         assert_eq!(written.user_defined(), named.as_slice());
         assert_eq!(read(&written), Ok(message));
@@ -196,7 +196,7 @@ fn archives_of_all_versions() {
 
 #[test]
 fn bad_messages_are_errors() {
-    let (basic, extended) = (Kind::RicartAgrawala, Kind::RicartAgrawalaExtended);
+    let (basic, extended) = (Algorithm::RicartAgrawala, Algorithm::RicartAgrawalaExtended);
     let request = |protocol: &str, content: &str| {
         recorded(Performative::Request, protocol, "a_1", "", content)
     };
@@ -246,7 +246,7 @@ fn bad_messages_are_errors() {
         "22 serialization::archive 18 3 rsc 0 0 0 0 0 0 0 0 0 0 x",
         "22 serialization::archive 18 3 rsc 0 1 0 0 0 0 0 0 0 0",
     ] {
-        let error = error(&token(content), Kind::SuzukiKasami);
+        let error = error(&token(content), Algorithm::SuzukiKasami);
         assert!(
             matches!(error, DecodeError::Token { .. }),
             "{content}: {error}"
@@ -258,7 +258,7 @@ fn name() -> impl Strategy<Value = String> {
     "[a-zA-Z0-9_@. äß]{1,12}"
 }
 
-fn act() -> impl Strategy<Value = (Kind, Act)> {
+fn act() -> impl Strategy<Value = (Algorithm, Act)> {
     let number = 0..=i32::MAX as u64;
     let position = (any::<u64>(), any::<u64>());
     let fence = (name(), position, any::<u64>()).prop_map(|(owner, position, run)| {
@@ -276,9 +276,9 @@ fn act() -> impl Strategy<Value = (Kind, Act)> {
             archive,
         },
     );
-    let ra = Kind::RicartAgrawalaExtended;
-    let sk = Kind::SuzukiKasamiExtended;
-    let queue = Kind::OwnerQueue;
+    let ra = Algorithm::RicartAgrawalaExtended;
+    let sk = Algorithm::SuzukiKasamiExtended;
+    let queue = Algorithm::OwnerQueue;
     let kind = prop_oneof![Just(ra), Just(sk)];
     let any_kind = prop_oneof![Just(ra), Just(sk), Just(queue)];
     let place = 1..=MAX_PLACE;
@@ -338,7 +338,7 @@ proptest! {
         );
         let message = LockMessage {
             conversation: Conversation::parse(&conversation),
-            dialect: Dialect::Own,
+            dialect: LockDialect::Own,
             algorithm: (!names_none).then_some(kind),
             content: Content::Lock { resource: Resource::new(&resource).unwrap(), act },
         };
@@ -350,7 +350,7 @@ proptest! {
 
     #[test]
     fn no_text_makes_the_readers_panic(text in ".{0,80}", performative in 0..22_usize) {
-        for kind in Kind::ALL {
+        for kind in Algorithm::ALL {
             for protocol in [kind.protocol(), DISCOVER, PROBE, FENCES] {
                 let performative = Performative::STANDARD[performative].clone();
                 for language in [BOOST_TOKEN, TOKEN] {

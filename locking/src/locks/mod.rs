@@ -12,8 +12,8 @@ use crate::holder::{Holder, HolderStep};
 use crate::owner::{Ending, Grant, Owner, OwnerStep};
 use crate::probes::{ProbeStep, Probes};
 use crate::{
-    Act, Algorithm, Content, Conversation, Dialect, Fence, Gate, Kind, LockMessage, Millis,
-    Options, OwnerState, Peer, Refusal, Resource,
+    Act, Algorithm, Content, Conversation, Fence, Gate, LockDialect, LockMessage, Millis,
+    MutualExclusion, Options, OwnerState, Peer, Refusal, Resource,
 };
 
 /// Maximum number of members. Messages of further agents are ignored.
@@ -112,7 +112,7 @@ pub enum Event {
         /// The other agent.
         by: Peer,
         /// Its algorithm.
-        algorithm: Kind,
+        algorithm: Algorithm,
     },
     /// This owner granted a resource.
     Granted {
@@ -168,10 +168,10 @@ pub enum Failure {
     /// The owner names another algorithm than the one that this agent was told to use.
     #[error("the owner uses the algorithm {owner}, and this agent was told to use {here}")]
     Algorithm {
-        /// Algorithm of the owner.
-        owner: Kind,
-        /// Algorithm of this agent.
-        here: Kind,
+        /// MutualExclusion of the owner.
+        owner: Algorithm,
+        /// MutualExclusion of this agent.
+        here: Algorithm,
     },
     /// A resource of the claim was lost before all were acquired.
     #[error("the lock of another resource of the claim was lost")]
@@ -206,7 +206,7 @@ pub struct LockStatus {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Locks<A> {
     me: Peer,
-    kind: Kind,
+    kind: Algorithm,
     options: Options,
     members: BTreeMap<Peer, Member>,
     gone: VecDeque<Peer>,
@@ -233,7 +233,7 @@ struct Entry<A> {
     /// Highest fence of each owner that this agent or a device of it has seen.
     seen: BTreeMap<Arc<str>, Fence>,
     /// The algorithm, which the owner names.
-    kind: Kind,
+    kind: Algorithm,
     /// The request that waited at an owner that is lost.
     former: Option<Former>,
     /// The gate that the algorithm was told.
@@ -301,10 +301,10 @@ use queued::Former;
 
 type Actions = Vec<Action>;
 
-impl<A: Algorithm> Locks<A> {
+impl<A: MutualExclusion> Locks<A> {
     /// Creates the core of an agent without members and resources.
     #[must_use]
-    pub fn new(me: Peer, kind: Kind, options: Options) -> Self {
+    pub fn new(me: Peer, kind: Algorithm, options: Options) -> Self {
         Self {
             me,
             kind,
@@ -334,7 +334,7 @@ impl<A: Algorithm> Locks<A> {
     /// The algorithm that this agent was told to use. With the owner's queue, it uses the algorithm that the owner of
     /// each resource names.
     #[must_use]
-    pub fn kind(&self) -> Kind {
+    pub fn kind(&self) -> Algorithm {
         self.kind
     }
 
@@ -518,7 +518,7 @@ impl<A: Algorithm> Locks<A> {
         }
         // An owner that needs a report is no owner before it has one.
         let claim = if needs_report { silence } else { options.claim };
-        if entry.kind == Kind::OwnerQueue {
+        if entry.kind == Algorithm::OwnerQueue {
             core.be_fair(options.probe_timeout);
         }
         entry.owned = Some(Owned {
@@ -625,7 +625,7 @@ impl<A: Algorithm> Locks<A> {
         out: &mut Actions,
     ) {
         let dialect = self.members.get(&owner).map(|member| member.dialect);
-        if dialect == Some(Dialect::Own) {
+        if dialect == Some(LockDialect::Own) {
             let act = Act::Seen {
                 fence: fence.clone(),
             };
@@ -680,7 +680,7 @@ impl<A: Algorithm> Locks<A> {
     // ----- members
 
     /// Adds a member, or updates its dialect.
-    pub fn join(&mut self, now: Millis, peer: &Peer, dialect: Dialect, out: &mut Actions) {
+    pub fn join(&mut self, now: Millis, peer: &Peer, dialect: LockDialect, out: &mut Actions) {
         self.admit_member(now, peer, dialect, out);
         self.settle(now, out);
     }
@@ -725,10 +725,10 @@ impl<A: Algorithm> Locks<A> {
         now: Millis,
         resource: &Resource,
         owner: &Peer,
-        dialect: Dialect,
+        dialect: LockDialect,
         out: &mut Actions,
     ) {
-        let named = (dialect == Dialect::Own).then_some(self.kind);
+        let named = (dialect == LockDialect::Own).then_some(self.kind);
         self.owner_named(now, resource, owner, dialect, named, out);
     }
 
@@ -739,8 +739,8 @@ impl<A: Algorithm> Locks<A> {
         now: Millis,
         resource: &Resource,
         owner: &Peer,
-        dialect: Dialect,
-        algorithm: Option<Kind>,
+        dialect: LockDialect,
+        algorithm: Option<Algorithm>,
         out: &mut Actions,
     ) {
         if *owner != self.me && self.admit_member(now, owner, dialect, out) {
@@ -756,7 +756,7 @@ impl<A: Algorithm> Locks<A> {
     pub fn probe(&mut self, now: Millis, to: Peer, out: &mut Actions) {
         let message = LockMessage {
             conversation: self.side_conversation("probe", now),
-            dialect: Dialect::Own,
+            dialect: LockDialect::Own,
             algorithm: None,
             content: Content::Probe,
         };
@@ -824,7 +824,7 @@ impl<A: Algorithm> Locks<A> {
                 self.probed(now, from);
                 let answer = LockMessage {
                     conversation: conversation.clone(),
-                    dialect: Dialect::Own,
+                    dialect: LockDialect::Own,
                     algorithm: None,
                     content: Content::Alive,
                 };
@@ -881,7 +881,7 @@ impl<A: Algorithm> Locks<A> {
         from: &Peer,
         resource: &Resource,
         conversation: &Conversation,
-        (act, algorithm): (&Act, Option<Kind>),
+        (act, algorithm): (&Act, Option<Algorithm>),
         out: &mut Actions,
     ) {
         // An earlier registration of this agent is no other owner.
@@ -901,7 +901,7 @@ impl<A: Algorithm> Locks<A> {
                     self.learn_owner(now, resource, from, algorithm, out);
                 } else if (*act == Act::Query { claim: true }) {
                     if self.is_return(resource, from) {
-                        self.learn_owner(now, resource, from, Some(Kind::OwnerQueue), out);
+                        self.learn_owner(now, resource, from, Some(Algorithm::OwnerQueue), out);
                     }
                     // The owner may have started without its state file.
                     self.tell_seen(now, from, resource, out);
@@ -1063,7 +1063,7 @@ impl<A: Algorithm> Locks<A> {
         from: &Peer,
         resource: &Resource,
         conversation: &Conversation,
-        (act, algorithm): (&Act, Option<Kind>),
+        (act, algorithm): (&Act, Option<Algorithm>),
         out: &mut Actions,
     ) {
         let kind = algorithm.unwrap_or(self.kind);
@@ -1121,7 +1121,7 @@ impl<A: Algorithm> Locks<A> {
         &mut self,
         now: Millis,
         peer: &Peer,
-        dialect: Dialect,
+        dialect: LockDialect,
         out: &mut Actions,
     ) -> bool {
         if *peer == self.me || self.gone.contains(peer) {
@@ -1130,7 +1130,7 @@ impl<A: Algorithm> Locks<A> {
         self.no_longer_expect(peer);
         if let Some(member) = self.members.get_mut(peer) {
             member.suspected = false;
-            if dialect == Dialect::Own {
+            if dialect == LockDialect::Own {
                 member.dialect = dialect;
             }
             return true;
@@ -1154,7 +1154,7 @@ impl<A: Algorithm> Locks<A> {
                 .is_some_and(|current| matches!(current.phase, Phase::Discovering { .. }));
             let act = match &entry.owned {
                 Some(owned) if owned.claim_until.is_some() => Some(Act::Query { claim: true }),
-                Some(_) => (dialect == Dialect::Own).then_some(Act::Owned),
+                Some(_) => (dialect == LockDialect::Own).then_some(Act::Owned),
                 None => discovering.then_some(Act::Query { claim: false }),
             };
             if let Some(act) = act {
@@ -1239,7 +1239,7 @@ impl<A: Algorithm> Locks<A> {
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
         };
-        if entry.kind == Kind::OwnerQueue && *peer != self.me {
+        if entry.kind == Algorithm::OwnerQueue && *peer != self.me {
             return self.lose_queue(now, resource, peer);
         }
         let mut failed = Vec::new();
@@ -1278,7 +1278,7 @@ impl<A: Algorithm> Locks<A> {
         now: Millis,
         resource: &Resource,
         peer: &Peer,
-        named: Option<Kind>,
+        named: Option<Algorithm>,
         out: &mut Actions,
     ) {
         let Some(entry) = self.resources.get(resource) else {
@@ -1299,7 +1299,7 @@ impl<A: Algorithm> Locks<A> {
             None => {}
         }
         let member = self.members.get(peer);
-        let is_own = member.is_some_and(|member| member.dialect == Dialect::Own);
+        let is_own = member.is_some_and(|member| member.dialect == LockDialect::Own);
         let kind = named.filter(|_| is_own).unwrap_or_else(|| self.unnamed());
         self.set_algorithm(resource, kind);
         let Some(entry) = self.resources.get_mut(resource) else {
@@ -1443,13 +1443,13 @@ impl<A: Algorithm> Locks<A> {
         let conversation = conversation.clone();
         let mut steps = Vec::new();
         let holder = match dialect {
-            _ if kind == Kind::OwnerQueue => {
+            _ if kind == Algorithm::OwnerQueue => {
                 let former = entry.former.take();
                 let former = former.filter(|former| former.claim == current.claim);
                 let place = former.and_then(|former| former.place);
                 Holder::queued(conversation, now, place, &self.options, &mut steps)
             }
-            Some(Dialect::Legacy) => {
+            Some(LockDialect::Legacy) => {
                 Holder::unfenced(conversation, report, &self.options, &mut steps)
             }
             // This agent, or an agent of this library.
@@ -1661,7 +1661,7 @@ impl<A: Algorithm> Locks<A> {
         let members: Vec<_> = self
             .members
             .iter()
-            .filter(|(_, member)| member.dialect == Dialect::Own)
+            .filter(|(_, member)| member.dialect == LockDialect::Own)
             .map(|(peer, _)| peer.clone())
             .collect();
         for member in members {
@@ -1902,7 +1902,7 @@ impl<A: Algorithm> Locks<A> {
                     act,
                 } => {
                     let dialect = self.members.get(&to).map(|member| member.dialect);
-                    if matches!(act, Act::Token(_)) && dialect == Some(Dialect::Legacy) {
+                    if matches!(act, Act::Token(_)) && dialect == Some(LockDialect::Legacy) {
                         self.at_owner(resource, out, |core, steps| {
                             core.entered_without_report(&to, &conversation, steps);
                         });
@@ -1939,7 +1939,7 @@ impl<A: Algorithm> Locks<A> {
     /// Sends a message of an algorithm.
     fn send_in(
         &mut self,
-        kind: Kind,
+        kind: Algorithm,
         to: Peer,
         resource: &Resource,
         conversation: Conversation,
@@ -1948,7 +1948,7 @@ impl<A: Algorithm> Locks<A> {
     ) {
         let message = LockMessage {
             conversation,
-            dialect: Dialect::Own,
+            dialect: LockDialect::Own,
             algorithm: self.algorithm_in(&act, kind, &to),
             content: Content::Lock {
                 resource: resource.clone(),

@@ -9,8 +9,8 @@
 use super::{Actions, Current, Locks, Phase};
 use crate::locks::{Action, ClaimId, Event, Failure};
 use crate::{
-    Act, Algorithm, Content, Conversation, Dialect, Kind, LockMessage, Millis, Peer, Refusal,
-    Resource,
+    Act, Algorithm, Content, Conversation, LockDialect, LockMessage, Millis, MutualExclusion, Peer,
+    Refusal, Resource,
 };
 
 /// A request that waited at an owner that is lost.
@@ -38,29 +38,29 @@ fn is_of_algorithm(act: &Act) -> bool {
     )
 }
 
-impl<A: Algorithm> Locks<A> {
+impl<A: MutualExclusion> Locks<A> {
     // ----- algorithms
 
-    /// Algorithm of a resource.
-    pub(super) fn kind_of(&self, resource: &Resource) -> Kind {
+    /// MutualExclusion of a resource.
+    pub(super) fn kind_of(&self, resource: &Resource) -> Algorithm {
         let entry = self.resources.get(resource);
         entry.map_or(self.kind, |entry| entry.kind)
     }
 
     /// Whether this agent uses an algorithm.
-    pub(super) fn accepts(&self, kind: Kind) -> bool {
-        self.kind == Kind::OwnerQueue || self.kind == kind
+    pub(super) fn accepts(&self, kind: Algorithm) -> bool {
+        self.kind == Algorithm::OwnerQueue || self.kind == kind
     }
 
-    /// Algorithm at an owner that names none: one of `distributed_locking`.
-    pub(super) fn unnamed(&self) -> Kind {
+    /// MutualExclusion at an owner that names none: one of `distributed_locking`.
+    pub(super) fn unnamed(&self) -> Algorithm {
         match self.kind {
-            Kind::OwnerQueue => self.options.legacy_algorithm,
+            Algorithm::OwnerQueue => self.options.legacy_algorithm,
             kind => kind,
         }
     }
 
-    pub(super) fn set_algorithm(&mut self, resource: &Resource, kind: Kind) {
+    pub(super) fn set_algorithm(&mut self, resource: &Resource, kind: Algorithm) {
         if let Some(entry) = self.resources.get_mut(resource)
             && entry.kind != kind
         {
@@ -69,9 +69,9 @@ impl<A: Algorithm> Locks<A> {
         }
     }
 
-    /// Algorithm of the resources that this agent begins to own.
+    /// MutualExclusion of the resources that this agent begins to own.
     #[must_use]
-    pub fn own_algorithm(&self) -> Kind {
+    pub fn own_algorithm(&self) -> Algorithm {
         match self.options.legacy_peers {
             true => self.unnamed(),
             false => self.kind,
@@ -93,14 +93,14 @@ impl<A: Algorithm> Locks<A> {
     }
 
     /// The algorithm that a message contains. Agents of `distributed_locking` know no names of algorithms.
-    pub(super) fn algorithm_in(&self, act: &Act, kind: Kind, to: &Peer) -> Option<Kind> {
+    pub(super) fn algorithm_in(&self, act: &Act, kind: Algorithm, to: &Peer) -> Option<Algorithm> {
         match act {
             act if is_of_algorithm(act) => Some(kind),
             Act::Granted { .. } | Act::Refused { .. } | Act::Release => Some(kind),
             Act::Owned => {
                 let member = self.members.get(to);
                 member
-                    .is_some_and(|member| member.dialect == Dialect::Own)
+                    .is_some_and(|member| member.dialect == LockDialect::Own)
                     .then_some(kind)
             }
             _ => None,
@@ -177,7 +177,7 @@ impl<A: Algorithm> Locks<A> {
         from: &Peer,
         resource: &Resource,
         conversation: &Conversation,
-        kind: Kind,
+        kind: Algorithm,
         out: &mut Actions,
     ) {
         let Some(entry) = self.resources.get(resource) else {
@@ -203,7 +203,7 @@ impl<A: Algorithm> Locks<A> {
         now: Millis,
         resource: &Resource,
         claim: ClaimId,
-        kind: Kind,
+        kind: Algorithm,
         out: &mut Actions,
     ) {
         self.end_current(now, resource, out);
@@ -255,7 +255,7 @@ impl<A: Algorithm> Locks<A> {
         self.resources.get(resource).is_some_and(|entry| {
             let former = entry.former.as_ref().map(|former| &former.owner);
             let mut owners = entry.owner.iter().chain(former);
-            entry.kind == Kind::OwnerQueue && owners.any(|owner| owner.name() == from.name())
+            entry.kind == Algorithm::OwnerQueue && owners.any(|owner| owner.name() == from.name())
         })
     }
 
@@ -308,7 +308,7 @@ impl<A: Algorithm> Locks<A> {
     pub(super) fn heard_again(&mut self, now: Millis, peer: &Peer, out: &mut Actions) {
         let owned = self.resources.iter().filter(|(_, entry)| {
             let core = entry.owned.as_ref().map(|owned| &owned.core);
-            entry.kind == Kind::OwnerQueue
+            entry.kind == Algorithm::OwnerQueue
                 && core.is_some_and(|core| core.waiters().any(|waiter| waiter == peer))
         });
         let owned: Vec<_> = owned.map(|(resource, _)| resource.clone()).collect();

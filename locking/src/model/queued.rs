@@ -3,15 +3,15 @@
 
 use super::system::{Faults, System, Time};
 use super::tests::{NONE, SMALL, explore, holds, system};
-use crate::Kind;
+use crate::Algorithm;
 use crate::faults::Fault;
 
 fn prompt(claims: &[u8], faults: Faults) -> System {
-    system(Kind::OwnerQueue, claims, Time::Prompt, faults)
+    system(Algorithm::OwnerQueue, claims, Time::Prompt, faults)
 }
 
 fn free(claims: &[u8], ticks: u8, faults: Faults) -> System {
-    system(Kind::OwnerQueue, claims, Time::Free(ticks), faults)
+    system(Algorithm::OwnerQueue, claims, Time::Free(ticks), faults)
 }
 
 const RESTARTS: Faults = Faults {

@@ -7,8 +7,8 @@ use stateright::{Model, Property};
 use crate::faults::Fault;
 use crate::invariants::{History, Turns};
 use crate::{
-    Act, Action, Admission, AnyAlgorithm, ClaimId, Content, Conversation, Dialect, Event, Fence,
-    Kind, LockMessage, Locks, Millis, NotAdmitted, Options, OwnerState, Peer, Resource,
+    Act, Action, Admission, Algorithm, AnyAlgorithm, ClaimId, Content, Conversation, Event, Fence,
+    LockDialect, LockMessage, Locks, Millis, NotAdmitted, Options, OwnerState, Peer, Resource,
 };
 
 /// The time of each state. It exceeds every span, so that no time before it is cut off at 0.
@@ -52,7 +52,7 @@ pub(super) enum Memory {
 
 #[derive(Debug, Clone)]
 pub(super) struct System {
-    pub(super) kind: Kind,
+    pub(super) kind: Algorithm,
     /// Number of claims of each agent. Agent 0 is the owner.
     pub(super) claims: Vec<u8>,
     pub(super) time: Time,
@@ -173,13 +173,13 @@ impl System {
         (self.foreign_owner && agent == 0) || self.foreigner == Some(agent)
     }
 
-    fn dialect(&self, peer: &Peer) -> Dialect {
+    fn dialect(&self, peer: &Peer) -> LockDialect {
         let is = (0..)
             .take(self.claims.len())
             .find(|agent| name(*agent) == peer.name());
         match is.is_some_and(|agent| self.is_foreign(agent)) {
-            true => Dialect::Legacy,
-            false => Dialect::Own,
+            true => LockDialect::Legacy,
+            false => LockDialect::Own,
         }
     }
 
@@ -231,12 +231,12 @@ impl System {
             let mut out = Vec::new();
             let locks = state.locks(agent);
             for peer in &peers {
-                locks.join(NOW, peer, Dialect::Own, &mut out);
+                locks.join(NOW, peer, LockDialect::Own, &mut out);
             }
             if agent == 0 {
                 locks.own(NOW, &resource(), &life, &mut out);
             } else {
-                locks.owner_known(NOW, &resource(), &peers[0], Dialect::Own, &mut out);
+                locks.owner_known(NOW, &resource(), &peers[0], LockDialect::Own, &mut out);
             }
         }
         let out = &mut Vec::new();
@@ -467,10 +467,10 @@ impl System {
             .then(|| state.agents[0].me.clone());
         self.call(state, agent, |locks, out| {
             for peer in &peers {
-                locks.join(NOW, peer, Dialect::Own, out);
+                locks.join(NOW, peer, LockDialect::Own, out);
             }
             if let Some(owner) = owner.filter(|_| agent != 0) {
-                locks.owner_known(NOW, &resource(), &owner, Dialect::Own, out);
+                locks.owner_known(NOW, &resource(), &owner, LockDialect::Own, out);
             }
         });
     }
@@ -487,7 +487,7 @@ impl System {
             .map(|(other, of)| (other, of.me.clone()))
             .collect();
         self.call(state, agent, |locks, out| {
-            locks.join(NOW, &owner, Dialect::Legacy, out);
+            locks.join(NOW, &owner, LockDialect::Legacy, out);
         });
         for (other, peer) in others {
             self.list(state, &peer, agent);
@@ -511,7 +511,7 @@ impl System {
             let conversation = Conversation::new(format!("{}_probe", name(agent)).into(), 0);
             let message = LockMessage {
                 conversation,
-                dialect: Dialect::Own,
+                dialect: LockDialect::Own,
                 algorithm: None,
                 content: Content::Probe,
             };
@@ -660,7 +660,7 @@ impl Model for System {
                 actions.push(Step::Crash(number));
             }
             // An agent of a queue can also be stopped while it waits for its turn.
-            let waits = self.kind == Kind::OwnerQueue && agent.claim.is_some();
+            let waits = self.kind == Algorithm::OwnerQueue && agent.claim.is_some();
             if left.pauses > 0 && (agent.acquired || waits) {
                 actions.push(Step::Pause(number));
             }
@@ -700,7 +700,7 @@ impl Model for System {
                 let mut actions = Vec::new();
                 let locks = agent.locks.as_mut()?;
                 if let Some(owner) = owner {
-                    locks.owner_known(NOW, &resource(), &owner, Dialect::Legacy, &mut actions);
+                    locks.owner_known(NOW, &resource(), &owner, LockDialect::Legacy, &mut actions);
                 }
                 agent.claim = Some(locks.lock(NOW, &resource(), None, &mut actions));
                 if self.turns {

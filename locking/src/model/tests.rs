@@ -4,13 +4,13 @@ use stateright::{Checker, Model};
 
 use super::graph::Graph;
 use super::system::{Faults, Memory, State, Step, System, Time};
-use crate::Kind;
+use crate::Algorithm;
 use crate::faults::Fault;
 
 /// More states than any configuration that runs by default.
 pub(super) const SMALL: usize = 300_000;
 
-pub(super) fn system(kind: Kind, claims: &[u8], time: Time, faults: Faults) -> System {
+pub(super) fn system(kind: Algorithm, claims: &[u8], time: Time, faults: Faults) -> System {
     System {
         kind,
         claims: claims.to_vec(),
@@ -27,7 +27,7 @@ pub(super) fn system(kind: Kind, claims: &[u8], time: Time, faults: Faults) -> S
 }
 
 /// An owner of `distributed_locking`, and agents that start one after the other.
-fn strangers(kind: Kind, claims: &[u8], foreigner: Option<u8>) -> System {
+fn strangers(kind: Algorithm, claims: &[u8], foreigner: Option<u8>) -> System {
     System {
         foreign_owner: true,
         foreigner,
@@ -90,22 +90,22 @@ pub(super) const NONE: Faults = Faults {
 
 #[test]
 fn two_requesters_and_delayed_messages() {
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         holds(&system(kind, &[0, 1, 1], Time::Free(1), NONE));
     }
 }
 
 #[test]
 fn the_owner_and_a_requester() {
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         holds(&system(kind, &[1, 1], Time::Prompt, NONE));
     }
 }
 
-const EXTENDED: [Kind; 3] = [
-    Kind::OwnerQueue,
-    Kind::RicartAgrawalaExtended,
-    Kind::SuzukiKasamiExtended,
+const EXTENDED: [Algorithm; 3] = [
+    Algorithm::OwnerQueue,
+    Algorithm::RicartAgrawalaExtended,
+    Algorithm::SuzukiKasamiExtended,
 ];
 
 #[test]
@@ -134,7 +134,7 @@ fn a_requester_crashes_and_returns() {
 
 #[test]
 fn a_request_is_withdrawn() {
-    for kind in Kind::ALL {
+    for kind in Algorithm::ALL {
         let faults = Faults {
             withdrawals: 1,
             ..NONE
@@ -171,7 +171,7 @@ fn an_owner_starts_on_another_host_and_comes_back() {
     }
 }
 
-fn without_clock(kind: Kind) -> System {
+fn without_clock(kind: Algorithm) -> System {
     let faults = Faults {
         moves: 1,
         losses: 1,
@@ -184,7 +184,7 @@ fn without_clock(kind: Kind) -> System {
 }
 
 /// An owner without a state file was told to forget fences that are in use.
-fn forgetful(kind: Kind) -> System {
+fn forgetful(kind: Algorithm) -> System {
     let faults = Faults {
         moves: 1,
         commands: 2,
@@ -207,7 +207,12 @@ fn a_device_admits_one_of_two_runs_with_the_same_epoch() {
 /// The checker of `stateright` explores the same states and finds no counterexample either.
 #[test]
 fn stateright_agrees() {
-    let model = system(Kind::SuzukiKasamiExtended, &[1, 1], Time::Free(2), NONE);
+    let model = system(
+        Algorithm::SuzukiKasamiExtended,
+        &[1, 1],
+        Time::Free(2),
+        NONE,
+    );
     let checker = model.clone().checker().threads(2).spawn_bfs().join();
     checker.assert_properties();
     assert_eq!(checker.unique_state_count(), holds(&model));
@@ -216,8 +221,8 @@ fn stateright_agrees() {
 /// Each mistake breaks an invariant, in a configuration in which the core without it breaks none.
 #[test]
 fn mistakes_are_found() {
-    let basic = Kind::RicartAgrawala;
-    let token = Kind::SuzukiKasamiExtended;
+    let basic = Algorithm::RicartAgrawala;
+    let token = Algorithm::SuzukiKasamiExtended;
     let prompt = |kind, claims: &[u8], faults| system(kind, claims, Time::Prompt, faults);
     let free = |ticks, lease, faults| System {
         lease,
@@ -235,7 +240,7 @@ fn mistakes_are_found() {
         probes: true,
         ..free(3, 3, NONE)
     };
-    let ricart = Kind::RicartAgrawalaExtended;
+    let ricart = Algorithm::RicartAgrawalaExtended;
     let moves = |moves, memory| System {
         memory,
         lease: 2,
@@ -247,7 +252,7 @@ fn mistakes_are_found() {
         (Fault::GrantAfterRestart, free(1, 4, restarts), 4),
         (
             Fault::KeepEpoch,
-            prompt(Kind::RicartAgrawalaExtended, &[0, 2], restarts),
+            prompt(Algorithm::RicartAgrawalaExtended, &[0, 2], restarts),
             1,
         ),
         (Fault::FileOnly, moves(1, Memory::Clocks), 1),
@@ -270,7 +275,7 @@ fn mistakes_are_found() {
 /// Agents that start while others request a resource without fences, or hold it, never hold it together with them.
 #[test]
 fn agents_join_during_requests() {
-    let basic = Kind::RicartAgrawala;
+    let basic = Algorithm::RicartAgrawala;
     holds(&strangers(basic, &[0, 1, 1], None));
     holds(&strangers(basic, &[0, 1, 1], Some(1)));
     holds(&strangers(basic, &[0, 1, 1], Some(2)));
@@ -297,7 +302,12 @@ fn an_agent_that_was_killed_and_returns_has_its_turn() {
     let model = System {
         turns: true,
         lease: 2,
-        ..system(Kind::SuzukiKasamiExtended, &[0, 2, 3], Time::Prompt, faults)
+        ..system(
+            Algorithm::SuzukiKasamiExtended,
+            &[0, 2, 3],
+            Time::Prompt,
+            faults,
+        )
     };
     holds(&model);
     let fault = Fault::TakeWhole;
@@ -317,7 +327,9 @@ fn chosen() {
         .unwrap_or_else(|_| "ricart_agrawala_extended,claims=0.1".into());
     let mut words = text.split(',');
     let name = words.next().unwrap_or_default();
-    let kind = Kind::ALL.into_iter().find(|kind| kind.protocol() == name);
+    let kind = Algorithm::ALL
+        .into_iter()
+        .find(|kind| kind.protocol() == name);
     let kind = kind.expect("FIPA_LOCKS_MODEL begins with a protocol");
     let mut model = system(kind, &[0, 1], Time::Prompt, Faults::default());
     let mut stateright = false;

@@ -13,7 +13,7 @@
 use std::collections::VecDeque;
 
 use crate::owner::OwnerStep;
-use crate::{Act, Conversation, Dialect, Gate, Millis, Peer};
+use crate::{Act, Conversation, LockDialect, Gate, Millis, Peer};
 
 /// Highest place in an owner's queue that a member is told.
 pub const MAX_PLACE: u32 = 8;
@@ -69,10 +69,10 @@ impl Waiter {
         }
     }
 
-    fn dialect(&self) -> Dialect {
+    fn dialect(&self) -> LockDialect {
         match self.asked {
-            Some(_) => Dialect::Own,
-            None => Dialect::Legacy,
+            Some(_) => LockDialect::Own,
+            None => LockDialect::Legacy,
         }
     }
 }

@@ -5,7 +5,7 @@ use std::sync::{Arc, LazyLock};
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Message, Performative};
-use fipa_locking::{Kind, LockMessage, Millis, Peer, codec};
+use fipa_locking::{Algorithm, LockMessage, Millis, Peer, codec};
 use fipa_monitor::{Header, History, Library, Monitor, Policy, Verdict};
 
 const RECORDED: &str = include_str!("../vectors/distributed_locking.txt");
@@ -15,11 +15,11 @@ static LIBRARY: LazyLock<Arc<Library>> = LazyLock::new(|| Arc::new(Library::stan
 /// The monitor of one registration, as an agent has it that enforces protocols.
 pub(crate) struct Checked {
     monitor: Monitor,
-    kind: Kind,
+    kind: Algorithm,
 }
 
 impl Checked {
-    pub(crate) fn new(kind: Kind, me: &Peer) -> Self {
+    pub(crate) fn new(kind: Algorithm, me: &Peer) -> Self {
         let monitor = Monitor::agent(Arc::clone(&LIBRARY), me.name());
         // An earlier registration of the name may have begun conversations.
         let history = match me.registration() {
@@ -89,11 +89,11 @@ fn the_recorded_messages_of_the_cpp_library_fit() {
         (Monitor::observer(Arc::clone(&library)), agents)
     };
     let (mut observer, mut agents) = new();
-    let mut kind = Kind::default();
+    let mut kind = Algorithm::default();
     let mut messages = 0;
     for line in RECORDED.lines() {
         if let Some(name) = line.strip_prefix("== ") {
-            kind = *Kind::ALL
+            kind = *Algorithm::ALL
                 .iter()
                 .find(|kind| kind.protocol() == name)
                 .unwrap();

@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use fastrand::Rng;
 use fipa_locking::invariants::{History, Turns, all_or_none};
 use fipa_locking::{
-    Act, Action, AnyAlgorithm, ClaimId, Content, Dialect, Event, Kind, LockMessage, Locks, Millis,
-    Options, OwnerState, Peer, Resource,
+    Act, Action, Algorithm, AnyAlgorithm, ClaimId, Content, Event, LockDialect, LockMessage, Locks,
+    Millis, Options, OwnerState, Peer, Resource,
 };
 
 use crate::protocols::Checked;
@@ -19,7 +19,7 @@ const END: Millis = 200_000;
 
 #[derive(Clone, Copy)]
 pub(crate) struct Setup {
-    pub(crate) kind: Kind,
+    pub(crate) kind: Algorithm,
     pub(crate) agents: usize,
     /// Resource `n` belongs to agent `n`.
     pub(crate) resources: usize,
@@ -209,7 +209,7 @@ impl World {
             .collect();
         self.call(agent, |locks, now, out| {
             for (peer, _) in peers.iter().zip(alive).filter(|(_, alive)| *alive) {
-                locks.join(now, peer, Dialect::Own, out);
+                locks.join(now, peer, LockDialect::Own, out);
             }
         });
         if agent < self.setup.resources {

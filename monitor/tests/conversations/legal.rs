@@ -58,7 +58,7 @@ fn the_age_of_a_conversation_does_not_depend_on_the_wall_clock() {
     let mut monitor = Monitor::observer(library());
     let wall = SystemTime::UNIX_EPOCH + START;
     let day = Duration::from_secs(24 * 60 * 60);
-    let at = |wall, secs| Now::new(wall, Duration::from_secs(secs));
+    let at = |wall, secs| Moment::new(wall, Duration::from_secs(secs));
     let begin = request("request ann>ben");
     assert!(monitor.check(&begin, at(wall, 100)).is_accepted());
     // The wall clock is set 30 days ahead.

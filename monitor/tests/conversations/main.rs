@@ -17,7 +17,7 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Message, MessageView, Performative, Time};
 use fipa_monitor::{
-    Event, Header, History, Library, Limits, Machine, Monitor, Now, Policy, Unchecked, Verdict,
+    Event, Header, History, Library, Limits, Machine, Moment, Monitor, Policy, Unchecked, Verdict,
     Violation, ViolationKind as Kind,
 };
 

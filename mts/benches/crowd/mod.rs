@@ -7,8 +7,8 @@ use fipa_acl::{Letter, Payload};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, Arrival, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Principal, Stream,
-    Ticket, Verdict,
+    Answer, Arrival, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Principal,
+    Reaction, Stream, Ticket,
 };
 
 /// Number of agents of each peer.
@@ -123,7 +123,7 @@ impl Crowd {
             ticket: Some(Ticket(self.arrived)),
         };
         let verdict = self.core.handle_arrival(self.now, Kind::Tcp, arrival);
-        assert_eq!(verdict, Verdict::Now(Answer::Accepted));
+        assert_eq!(verdict, Reaction::Now(Answer::Accepted));
         let Some(Action::Deliverable { agent }) = self.core.poll_action() else {
             panic!("a letter that is not delivered");
         };

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use fipa_acl::Letter;
 use fipa_sds::{Entry, Reach, Role};
 use fipa_transport::{
-    Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Realm, Report, Ticket, Verdict,
+    Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Reaction, Realm, Report, Ticket,
 };
 
 use super::action::Action;
@@ -19,7 +19,7 @@ use crate::gate::{LetterParts, Link};
 impl Core {
     /// Handles a parcel that arrived by this kind of transport.
     #[inline]
-    pub fn handle_arrival(&mut self, now: Now, via: Kind, arrival: Arrival) -> Verdict {
+    pub fn handle_arrival(&mut self, now: Now, via: Kind, arrival: Arrival) -> Reaction {
         let read = self.reader.read_arrival(&arrival);
         self.handle_read_arrival(now, via, arrival, read)
     }
@@ -33,7 +33,7 @@ impl Core {
         via: Kind,
         arrival: Arrival,
         read: Option<Box<ReadLetter>>,
-    ) -> Verdict {
+    ) -> Reaction {
         let Arrival {
             mut parcel,
             from,
@@ -43,7 +43,7 @@ impl Core {
         let is_letter = matches!(parcel.body, Body::Letter(_));
         let view = &*self.table.view;
         if let Err(error) = self.principals.check_service(&from, is_letter, view) {
-            return Verdict::Now(Answer::failed(FailureReason::Refused, error.to_string()));
+            return Reaction::Now(Answer::failed(FailureReason::Refused, error.to_string()));
         }
         if from.is_remote() {
             parcel.stream.realm = match parcel.body {
@@ -70,9 +70,9 @@ impl Core {
         (via, from, ticket): (Kind, Hop, Option<Ticket>),
         label: &Label,
         (letter, read): (Letter, Option<Box<ReadLetter>>),
-    ) -> Verdict {
+    ) -> Reaction {
         if let Err(refusal) = self.check_letter(label, &from, &letter, read.as_deref()) {
-            return Verdict::Now(refusal);
+            return Reaction::Now(refusal);
         }
         let registration = label.stream.receiver;
         let Some(inbox) = self.agents.get_mut(&registration) else {
@@ -96,7 +96,7 @@ impl Core {
             let agent = registration;
             self.table.actions.push_back(Action::Deliverable { agent });
         }
-        Verdict::Now(answer)
+        Reaction::Now(answer)
     }
 
     /// Checks what a letter claims: its sender, its place in the stream, and its sizes.
@@ -169,7 +169,7 @@ impl Core {
         Ok(entry)
     }
 
-    fn handle_report(&mut self, now: Now, label: &Label, from: &Hop, report: Report) -> Verdict {
+    fn handle_report(&mut self, now: Now, label: &Label, from: &Hop, report: Report) -> Reaction {
         if let Some(lane) = self.lane_of(label.stream, &label.receiver) {
             let letter = (label.stream.receiver, label.sequence, label.transfer);
             self.with_lane(now, lane, |lane, table| {
@@ -177,20 +177,20 @@ impl Core {
             });
         }
         self.send_failures(now);
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     }
 
-    fn handle_credit(&mut self, now: Now, label: &Label, from: &Hop) -> Verdict {
+    fn handle_credit(&mut self, now: Now, label: &Label, from: &Hop) -> Reaction {
         if let Some(lane) = self.lane_of(label.stream, &label.receiver) {
             self.with_lane(now, lane, |lane, table| {
                 lane.credited(now.instant, from, table);
             });
         }
         self.send_failures(now);
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     }
 
-    fn handle_predecessor(&mut self, now: Now, label: &Label, from: &Hop) -> Verdict {
+    fn handle_predecessor(&mut self, now: Now, label: &Label, from: &Hop) -> Reaction {
         let mut answer = None;
         if let Some(lane) = self.lane_ids.get(&LaneKey::Custody(label.stream)) {
             let letter = (label.sequence, label.after, label.transfer);
@@ -203,7 +203,7 @@ impl Core {
         let is_reported = self
             .table
             .is_reporting(label.stream, label.sequence, label.transfer);
-        Verdict::Now(match answer {
+        Reaction::Now(match answer {
             Some(answer) => answer,
             None if is_reported => {
                 self.table.repeat_reports(now.instant, &from.location);

@@ -14,7 +14,7 @@ use fipa_transport::{
 use super::action::Action;
 use super::ids::registration_of;
 use super::inbox::Received;
-use super::lane::Delivery;
+use super::lane::OpenLetter;
 use super::lanes::own_lane;
 use super::limits::log_omitted;
 use super::origin::Origin;
@@ -181,7 +181,7 @@ impl Core {
             let deadline = now.instant + FAILURE_DEADLINE;
             let letter_of = (stream.receiver, sequence);
             let origin = Origin::FailureMessage;
-            let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
+            let delivery = OpenLetter::new(now.instant, origin, letter, letter_of, deadline);
             self.table
                 .notice(stream, sequence, &entry.name, || News::Sent {
                     send: None,

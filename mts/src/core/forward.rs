@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use fipa_acl::{DecodeError, Letter};
 use fipa_sds::{Entry, Source};
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Location, PeerId, Signature, Ticket, Verdict,
+    Answer, FailureReason, Hop, Incarnation, Kind, Location, PeerId, Reaction, Signature, Ticket,
     log_limit,
 };
 use smallvec::smallvec;
@@ -13,7 +13,7 @@ use smallvec::smallvec;
 use super::ids::LaneKey;
 use super::inbox::link_of;
 use super::label::Label;
-use super::lane::Delivery;
+use super::lane::OpenLetter;
 use super::origin::{Origin, Upstream};
 use super::{Core, MAX_DEADLINE, News, Now, ReadLetter};
 use crate::stamp::{self, EnvelopeParts};
@@ -38,27 +38,27 @@ impl Core {
         label: &Label,
         letter: Letter,
         read: Option<Box<ReadLetter>>,
-    ) -> Verdict {
+    ) -> Reaction {
         let (parts, envelope) = match read {
             Some(read) => (read.parts, read.envelope),
             None => (None, None),
         };
         let Some(envelope) = envelope else {
             let why = "the agent is no longer in this process";
-            return Verdict::Now(Answer::failed(FailureReason::NoSuchAgent, why));
+            return Reaction::Now(Answer::failed(FailureReason::NoSuchAgent, why));
         };
         let receiver = self.find_receiver(now, label, &from);
         let stamped =
             receiver.and_then(|entry| Ok((entry, self.stamped(now, letter, envelope, &from)?)));
         let (entry, (stamped, envelope)) = match stamped {
             Ok(stamped) => stamped,
-            Err(refusal) => return Verdict::Now(refusal),
+            Err(refusal) => return Reaction::Now(refusal),
         };
         let stream = label.stream;
         let key = LaneKey::Custody(stream);
         let taken = match unanswered {
-            Some(_) => Verdict::Later,
-            None => Verdict::Now(Answer::Custody),
+            Some(_) => Reaction::Later,
+            None => Reaction::Now(Answer::Custody),
         };
         let mut upstream = Upstream {
             back: from.location.clone(),
@@ -80,17 +80,17 @@ impl Core {
             };
         }
         if self.ending {
-            return Verdict::Now(Answer::Busy);
+            return Reaction::Now(Answer::Busy);
         }
         let id = self.lane(now, key, &entry.name);
         if let Some(lane) = self.lanes.get_mut(&id)
             && !lane.takes_into_custody(label.sequence, stamped.len(), &self.table)
         {
             lane.wait_for_credit(from.location);
-            return Verdict::Now(Answer::Busy);
+            return Reaction::Now(Answer::Busy);
         }
         if let Err(why) = self.ask_gate(now, &entry.name, parts.as_ref(), link_of(via, &from)) {
-            return Verdict::Now(Answer::failed(FailureReason::Refused, why));
+            return Reaction::Now(Answer::failed(FailureReason::Refused, why));
         }
         let is_contact =
             from.is_remote() && self.report_contact(now.instant, stream.sender, envelope, &from);
@@ -108,7 +108,7 @@ impl Core {
             upstreams: smallvec![upstream],
         };
         let letter_of = (stream.receiver, label.sequence);
-        let mut delivery = Delivery::new(now.instant, origin, stamped, letter_of, deadline);
+        let mut delivery = OpenLetter::new(now.instant, origin, stamped, letter_of, deadline);
         delivery.after = label.after;
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
         let sender = (stream.sender, from.is_remote());

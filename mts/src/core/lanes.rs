@@ -9,7 +9,7 @@ use fipa_transport::{Incarnation, Location, Stream};
 
 use super::attempts::AttemptTable;
 use super::ids::{LaneId, LaneKey, registration_of};
-use super::lane::{Delivery, Lane, PauseEnd};
+use super::lane::{Lane, OpenLetter, PauseEnd};
 use super::passes::{Concern, Step};
 use super::{Core, Now, work};
 
@@ -29,7 +29,7 @@ const IDLE_TIME_IN_A_CROWD: Duration = Duration::from_secs(1);
 
 impl Core {
     /// Puts a letter into its lane and dispatches what can be dispatched.
-    pub(super) fn put(&mut self, now: Now, lane: LaneId, delivery: Box<Delivery>) {
+    pub(super) fn put(&mut self, now: Now, lane: LaneId, delivery: Box<OpenLetter>) {
         self.with_lane(now, lane, |lane, table| {
             lane.push(delivery, table);
             lane.pump(now.instant, table);

@@ -8,7 +8,7 @@ use fipa_transport::{Answer, Body, Outcome, Parcel, Report, Stream};
 use super::News;
 use super::action::Action;
 use super::attempts::AttemptTable;
-use super::lane::Delivery;
+use super::lane::OpenLetter;
 use super::notes::{Note, note_parcel};
 use super::origin::{Origin, Settlement, Upstream};
 
@@ -16,12 +16,12 @@ impl AttemptTable {
     /// Reports the end of a letter to its sender, or to the services that handed it over.
     pub(crate) fn settle(
         &mut self,
-        delivery: Box<Delivery>,
+        delivery: Box<OpenLetter>,
         stream: Stream,
         receiver: Arc<str>,
         settlement: Settlement,
     ) {
-        let Delivery {
+        let OpenLetter {
             origin,
             sequence,
             deadline,

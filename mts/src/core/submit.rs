@@ -9,7 +9,7 @@ use fipa_transport::{Attempt, FailureReason, Incarnation, Outcome, Stream};
 
 use super::action::Action;
 use super::ids::{SubmissionId, registration_of};
-use super::lane::Delivery;
+use super::lane::OpenLetter;
 use super::lanes::own_lane;
 use super::origin::Origin;
 use super::undelivered::{FailureTarget, Undelivered};
@@ -278,7 +278,7 @@ impl Core {
         });
         let origin = Origin::Local { send };
         let letter_of = (stream.receiver, sequence);
-        let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
+        let delivery = OpenLetter::new(now.instant, origin, letter, letter_of, deadline);
         self.put(now, lane, delivery);
     }
 

@@ -14,7 +14,7 @@ use fipa_transport::{
 use super::action::Action;
 use super::contacts::{Answered, answered};
 use super::failures::cannot_be_decoded;
-use super::lane::Delivery;
+use super::lane::OpenLetter;
 use super::lanes::own_lane;
 use super::origin::Origin;
 use super::reading::{refused_name_of_legacy_peer, too_long};
@@ -402,7 +402,7 @@ impl Core {
         }
         let origin = Origin::LegacyPeer { from, failed };
         let letter_of = (stream.receiver, sequence);
-        let delivery = Delivery::new(now.instant, origin, letter.clone(), letter_of, until);
+        let delivery = OpenLetter::new(now.instant, origin, letter.clone(), letter_of, until);
         self.put(now, lane, delivery);
     }
 

@@ -396,7 +396,10 @@ impl Mts {
             let mut state = self.shared.lock();
             let now = state.clocks.now();
             let name = receiver.name();
-            match state.core.submit_to_name(now, sender, letter, name, deadline) {
+            match state
+                .core
+                .submit_to_name(now, sender, letter, name, deadline)
+            {
                 Ok(id) => return self.begun(state, id, Some(1)),
                 Err(back) => letter = back,
             }

@@ -7,7 +7,7 @@ use fipa_acl::{DecodeError, Letter};
 use fipa_sds::{Reach, Role};
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
-    LegacySource, LoanedContent, Location, Parcel, Sink, Verdict, log_limit, quota_address,
+    LegacySource, LoanedContent, Location, Parcel, Reaction, Sink, log_limit, quota_address,
 };
 use parking_lot::MutexGuard;
 
@@ -21,7 +21,7 @@ pub(super) struct TransportSink {
 }
 
 impl Sink for TransportSink {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         let Some(shared) = self.shared.upgrade() else {
             return closing();
         };
@@ -182,7 +182,7 @@ fn malformed(from: LegacySource, error: &DecodeError) {
     log_limit::warn!(of: quota_address(from.address), %error, "dropping an unframed letter: its envelope is malformed");
 }
 
-fn closing() -> Verdict {
+fn closing() -> Reaction {
     let reason = FailureReason::NoSuchAgent;
-    Verdict::Now(Answer::failed(reason, "the process is closing"))
+    Reaction::Now(Answer::failed(reason, "the process is closing"))
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel,
-    Principal, Ticket, TransportError, TransportErrorKind, Verdict,
+    Principal, Reaction, Ticket, TransportError, TransportErrorKind,
 };
 
 #[cfg(debug_assertions)]
@@ -455,17 +455,17 @@ impl World {
             // The verdict on a duplicate does not answer the attempt (rule 3 of transports).
             _ if copy => {}
             // The return path is disconnected.
-            Verdict::Now(_) if cut => {}
-            Verdict::Now(answer) => {
+            Reaction::Now(_) if cut => {}
+            Reaction::Now(answer) => {
                 let conclusion = match mute {
                     true => broken(),
                     false => Conclusion::Answered(answer),
                 };
                 self.conclude_within(self.weather.answering_ms, from, attempt, conclusion);
             }
-            Verdict::Later if at_once => return Err("a late answer without a ticket".into()),
-            Verdict::Later if mute => self.conclude_within(60, from, attempt, broken()),
-            Verdict::Later => {
+            Reaction::Later if at_once => return Err("a late answer without a ticket".into()),
+            Reaction::Later if mute => self.conclude_within(60, from, attempt, broken()),
+            Reaction::Later => {
                 process.tickets.insert(ticket, (from, attempt));
             }
         }

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 use fipa_platform::{
-    AgentDescription, Ams, Answer, ApDescription, Asker, Constraints, Df, Exception, Function, Now,
-    ONTOLOGY, Platform, Resident, ServiceDescription,
+    AgentDescription, Ams, Answer, ApDescription, Asker, Constraints, Df, Exception, Function,
+    ONTOLOGY, Platform, PlatformTime, Resident, ServiceDescription,
 };
 
 pub(crate) const OTHER: Platform = Platform::Proved([7; 32]);
@@ -26,9 +26,9 @@ impl Clock {
         Self(Instant::now())
     }
 
-    pub(crate) fn after(self, seconds: f64) -> Now {
+    pub(crate) fn after(self, seconds: f64) -> PlatformTime {
         let passed = Duration::from_secs_f64(seconds);
-        Now {
+        PlatformTime {
             at: self.0 + passed,
             wall: wall() + passed,
         }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use fipa_acl::ErrorChain;
 
-use super::{Area, Check, Verdict};
+use super::{Area, Check, Severity};
 use crate::Config;
 use crate::domain::files::{DomainDir, DomainDirError};
 use crate::domain::user_dir::Holder;
@@ -30,13 +30,13 @@ fn writing(dir: &DomainDir) -> Check {
             source,
         }) => AREA.problem(
             WRITING,
-            Verdict::Bad,
+            Severity::Bad,
             format!("{}: {problem} ({source})", path.display()),
             remedy,
         ),
         Err(error) => AREA.problem(
             WRITING,
-            Verdict::Bad,
+            Severity::Bad,
             ErrorChain(&error).to_string(),
             "follow the remedy above; until then no process can join the domain",
         ),
@@ -61,7 +61,7 @@ fn directory(dir: &DomainDir) -> Check {
         }
         Err(error) => AREA.problem(
             CHECK,
-            Verdict::Bad,
+            Severity::Bad,
             ErrorChain(&error).to_string(),
             "follow the remedy above; until then no process can join the domain",
         ),
@@ -73,7 +73,7 @@ fn name_held(path: &Path, holder: Holder) -> Check {
     let own = rustix::process::geteuid().as_raw();
     AREA.problem(
         CHECK,
-        Verdict::Doubtful,
+        Severity::Warning,
         format!(
             "{} is private; the domains of this user are not in /tmp/fipa-{own}, because {holder} holds that name",
             path.display(),

@@ -6,7 +6,7 @@ use fipa_acl::escape;
 use fipa_transport::Signature;
 
 use super::peers;
-use super::{Area, Check, Verdict};
+use super::{Area, Check, Severity};
 use crate::admin::routes::{
     Connected, ContestedName, Namesakes, RefusedConnection, RefusedDial, Report, StaticPeer,
 };
@@ -40,7 +40,7 @@ pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &m
         Ok(report) => report,
         Err(why) => {
             let advice = "see the log of the gateway; if it hangs, restart it (`fipa up`)";
-            checks.push(AREA.problem(CONFIGURATION, Verdict::Doubtful, why, advice));
+            checks.push(AREA.problem(CONFIGURATION, Severity::Warning, why, advice));
             return;
         }
     };
@@ -82,7 +82,7 @@ fn configuration(config: &Config, report: &Report) -> Check {
     let shown: Vec<String> = shown.collect();
     AREA.problem(
         CONFIGURATION,
-        Verdict::Doubtful,
+        Severity::Warning,
         format!("{name} runs with other values: {}{more}", shown.join("; ")),
         "write the values into ~/.config/fipa/fipa.toml, which all commands and programs read, instead of \
          --set; then restart the gateway",
@@ -111,7 +111,7 @@ fn static_peer(peer: &StaticPeer) -> Option<Check> {
     let found = format!("{} does not answer: {}", peer.name, failures.join("; "));
     Some(AREA.problem(
         PEERS,
-        Verdict::Doubtful,
+        Severity::Warning,
         found,
         "do what the reason says; the gateway asks its static peers again every few seconds",
     ))
@@ -122,7 +122,7 @@ fn contested(contested: &ContestedName) -> Check {
     let ContestedName { name, gateway } = contested;
     AREA.problem(
         NAMES,
-        Verdict::Doubtful,
+        Severity::Warning,
         format!(
             "the agent {name} is also registered at the gateway {gateway}: each other host reaches the one \
              that was announced to it first"
@@ -136,7 +136,7 @@ fn contested(contested: &ContestedName) -> Check {
 fn refused(refused: &RefusedConnection) -> Check {
     let RefusedConnection { from, why, seconds } = refused;
     let found = format!("from {from}, {seconds} s ago: {why}");
-    AREA.problem(REFUSED, Verdict::Doubtful, found, REFUSED_ADVICE)
+    AREA.problem(REFUSED, Severity::Warning, found, REFUSED_ADVICE)
 }
 
 /// Reports a connection of the gateway that a peer has refused.
@@ -144,7 +144,7 @@ fn refused_dial(refused: &RefusedDial) -> Check {
     let RefusedDial { to, why, seconds } = refused;
     AREA.problem(
         REFUSED_DIALS,
-        Verdict::Doubtful,
+        Severity::Warning,
         format!("{to}, {seconds} s ago: {}", escape(why)),
         "do what the reason says, mostly on the host of that peer: `fipa doctor` and the log of its gateway show \
          the refusal; with keys, both hosts trust each other's certificate (`fipa keys list`), and both run the \
@@ -167,8 +167,8 @@ fn namesakes(report: &Report, found: &Namesakes) -> Check {
     };
     // Without keys, any host can claim a name.
     let verdict = match found.is_proved {
-        true => Verdict::Bad,
-        false => Verdict::Doubtful,
+        true => Severity::Bad,
+        false => Severity::Warning,
     };
     AREA.problem(
         NAMESAKES,
@@ -232,12 +232,12 @@ mod tests {
     fn values_that_differ_from_those_of_the_gateway_are_listed() {
         let config = Config::for_host("sherpa");
         let same = configuration(&config, &report(&config));
-        assert_eq!(same.verdict, Verdict::Fine, "{}", same.found);
+        assert_eq!(same.verdict, Severity::Fine, "{}", same.found);
         let mut other = Config::for_host("sherpa");
         other.security.loopback = true;
         other.mts.queue = 7;
         let differs = configuration(&config, &report(&other));
-        assert_eq!(differs.verdict, Verdict::Doubtful);
+        assert_eq!(differs.verdict, Severity::Warning);
         let expected = "sherpa runs with other values: mts.queue = 7 (here: 256); security.loopback = true \
                         (here: false)";
         assert_eq!(differs.found, expected);
@@ -253,7 +253,7 @@ mod tests {
         });
         let mut checks = Vec::new();
         examine(&config, Ok(&report), &mut checks);
-        let listed = checks.iter().find(|check| check.verdict != Verdict::Fine);
+        let listed = checks.iter().find(|check| check.verdict != Severity::Fine);
         let found = &listed.unwrap().found;
         assert!(
             found.starts_with("the agent arm is also registered at the gateway crex:"),
@@ -288,7 +288,7 @@ mod tests {
             let checks = checks.map(|check| (check.verdict, check.found.as_str()));
             checks.collect::<Vec<_>>()
         };
-        let [(Verdict::Doubtful, refused)] = of(REFUSED_DIALS)[..] else {
+        let [(Severity::Warning, refused)] = of(REFUSED_DIALS)[..] else {
             panic!("{checks:?}");
         };
         assert!(
@@ -296,7 +296,7 @@ mod tests {
             "{refused}"
         );
         assert!(!refused.contains('\u{1b}'), "{refused}");
-        let [(Verdict::Bad, own), (Verdict::Doubtful, others)] = of(NAMESAKES)[..] else {
+        let [(Severity::Bad, own), (Severity::Warning, others)] = of(NAMESAKES)[..] else {
             panic!("{checks:?}");
         };
         assert!(
@@ -313,6 +313,6 @@ mod tests {
         let mut checks = Vec::new();
         examine(&Config::for_host("sherpa"), Err("no answer"), &mut checks);
         assert_eq!(checks.len(), 1);
-        assert_eq!(checks[0].verdict, Verdict::Doubtful);
+        assert_eq!(checks[0].verdict, Severity::Warning);
     }
 }

@@ -2,7 +2,7 @@
 
 use fipa_acl::ErrorChain;
 
-use super::{Area, Check, Verdict};
+use super::{Area, Check, Severity};
 use crate::{Config, Kind};
 
 const AREA: Area = Area("network");
@@ -36,7 +36,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
             Err(error) => {
                 checks.push(AREA.problem(
                     LOCATIONS,
-                    Verdict::Bad,
+                    Severity::Bad,
                     format!(
                         "transport.{kind}.listen cannot be used: {}",
                         ErrorChain(&error)
@@ -74,7 +74,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         (true, true) => AREA.fine(LOCATIONS, texts),
         (true, false) if other.is_some() => AREA.problem(
             LOCATIONS,
-            Verdict::Bad,
+            Severity::Bad,
             format!(
                 "{texts}: the network interfaces have no address of the family that `listen` lists{}, so the \
                  gateway announces no location",
@@ -85,7 +85,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         ),
         (true, false) => AREA.problem(
             LOCATIONS,
-            Verdict::Doubtful,
+            Severity::Warning,
             format!(
                 "{texts}: no network interface has an address, so the gateway announces no location"
             ),

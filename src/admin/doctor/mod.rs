@@ -34,10 +34,10 @@ pub struct Check {
     /// The name of the check, for example `size of /dev/shm`.
     pub check: &'static str,
     /// The verdict.
-    pub verdict: Verdict,
+    pub verdict: Severity,
     /// The state that was found, as text.
     pub found: String,
-    /// The remedy; `None` if the verdict is [`Verdict::Fine`].
+    /// The remedy; `None` if the verdict is [`Severity::Fine`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub advice: Option<String>,
 }
@@ -46,11 +46,11 @@ pub struct Check {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
-pub enum Verdict {
+pub enum Severity {
     /// The requirement is met.
     Fine,
     /// The requirement is met now, but may fail under load or later.
-    Doubtful,
+    Warning,
     /// The requirement is not met: a part of the configuration does not work.
     Bad,
 }
@@ -104,7 +104,7 @@ impl Area {
         Check {
             area: self.0,
             check,
-            verdict: Verdict::Fine,
+            verdict: Severity::Fine,
             found: found.into(),
             advice: None,
         }
@@ -113,7 +113,7 @@ impl Area {
     pub(crate) fn problem(
         &self,
         check: &'static str,
-        verdict: Verdict,
+        verdict: Severity,
         found: impl Into<String>,
         advice: impl Into<String>,
     ) -> Check {

@@ -5,7 +5,7 @@ use std::net::IpAddr;
 use fipa_sds::{MdnsConfig, Mts, Multicast, probe};
 use fipa_transport::Incarnation;
 
-use super::{Area, Check, Verdict};
+use super::{Area, Check, Severity};
 use crate::Config;
 
 const AREA: Area = Area("network");
@@ -24,7 +24,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     match probed {
         Ok(found) if found.is_empty() => checks.push(AREA.problem(
             MULTICAST,
-            Verdict::Doubtful,
+            Severity::Warning,
             "no interface is up among those that discovery.interfaces allows",
             "connect this host to the network, or change discovery.interfaces (`ip address` lists the \
              interfaces)",
@@ -32,7 +32,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         Ok(found) => checks.extend(found.iter().map(multicast)),
         Err(error) => checks.push(AREA.problem(
             MULTICAST,
-            Verdict::Bad,
+            Severity::Bad,
             format!("cannot list the network interfaces of this machine: {error}"),
             USE_STATIC,
         )),
@@ -50,7 +50,7 @@ fn multicast(found: &Multicast) -> Check {
     if let Some(error) = &found.error {
         let found = format!("multicast cannot be used: {error}");
         return problem(
-            Verdict::Bad,
+            Severity::Bad,
             &found,
             "allow UDP port 5353 in the firewall and check the route of the multicast groups (`ip \
              route`), or list other interfaces in discovery.interfaces",
@@ -60,13 +60,13 @@ fn multicast(found: &Multicast) -> Check {
         return if found.heard_itself {
             AREA.fine(MULTICAST, format!("{at}: multicast is sent and received"))
         } else {
-            problem(Verdict::Bad, NOT_EVEN_OWN, FIREWALL)
+            problem(Severity::Bad, NOT_EVEN_OWN, FIREWALL)
         };
     }
     match (found.heard.len(), found.answered.len()) {
-        (0, 0) if !found.heard_itself => problem(Verdict::Bad, NOT_EVEN_OWN, FIREWALL),
+        (0, 0) if !found.heard_itself => problem(Severity::Bad, NOT_EVEN_OWN, FIREWALL),
         (0, 0) => problem(
-            Verdict::Doubtful,
+            Severity::Warning,
             "multicast leaves this host, but no other host answered: none is running, or the network \
              filters multicast, as many Wi-Fi networks do",
             &format!(
@@ -75,7 +75,7 @@ fn multicast(found: &Multicast) -> Check {
             ),
         ),
         (0, _) => problem(
-            Verdict::Doubtful,
+            Severity::Warning,
             &format!(
                 "outgoing multicast works, incoming does not: {} answered by unicast, and no multicast \
                  packet of another host arrived",
@@ -88,7 +88,7 @@ fn multicast(found: &Multicast) -> Check {
             ),
         ),
         (_, 0) => problem(
-            Verdict::Doubtful,
+            Severity::Warning,
             &format!(
                 "incoming multicast works, outgoing may not: packets of {} arrived, but no host \
                  answered (a host without agents has nothing to answer)",

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use rustix::process::geteuid;
 
-use super::{Area, Check, Verdict};
+use super::{Area, Check, Severity};
 use crate::Config;
 use crate::domain::user_dir::{user_in, user_name};
 
@@ -95,7 +95,7 @@ fn report(others: &Others, domain: &str) -> Check {
     }
     AREA.problem(
         CHECK,
-        Verdict::Doubtful,
+        Severity::Warning,
         format!("{found}; a domain belongs to one user, so this user does not see those agents"),
         "run the commands as the user of the domain (for example: sudo -u USER fipa agents), unless \
          separate domains are intended",
@@ -137,10 +137,10 @@ mod tests {
         let found = others(&shm, &tmp, owner.wrapping_add(1));
         assert_eq!(found.len(), 1);
         let same = report(&found, "default");
-        assert_eq!(same.verdict, Verdict::Doubtful);
+        assert_eq!(same.verdict, Severity::Warning);
         let expected = format!("{} runs a domain `default` here", user_name(owner));
         assert!(same.found.starts_with(&expected), "{}", same.found);
-        assert_eq!(report(&found, "another").verdict, Verdict::Fine);
+        assert_eq!(report(&found, "another").verdict, Severity::Fine);
         fs::remove_file(shm.join("fipa_default_0123abcd_x")).unwrap();
         let unnamed = report(&others(&shm, &tmp, owner.wrapping_add(1)), "default");
         assert!(

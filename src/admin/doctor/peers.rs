@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use fipa_transport::threads;
 
-use super::{Area, Check, Verdict};
+use super::{Area, Check, Severity};
 use crate::{Config, Kind};
 
 const AREA: Area = Area("network");
@@ -56,7 +56,7 @@ pub(super) fn connect_all(
 fn check(title: &'static str, name: &str, address: &str) -> Check {
     let found = |what: &str| format!("{name}, tcp://{address}: {what}");
     let doubtful =
-        |what: &str, advice: String| AREA.problem(title, Verdict::Doubtful, found(what), advice);
+        |what: &str, advice: String| AREA.problem(title, Severity::Warning, found(what), advice);
     match connect(address) {
         Ok(()) => AREA.fine(title, found("accepts connections")),
         Err(error) if error.kind() == io::ErrorKind::TimedOut => {
@@ -104,12 +104,12 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap().to_string();
         let open = check(PORTS, "crex", &address);
-        assert_eq!(open.verdict, Verdict::Fine, "{}", open.found);
+        assert_eq!(open.verdict, Severity::Fine, "{}", open.found);
         let wrong = check(PORTS, "crex", "name without port");
-        assert_eq!(wrong.verdict, Verdict::Doubtful);
+        assert_eq!(wrong.verdict, Severity::Warning);
         drop(listener);
         let closed = check(PORTS, "crex", &address);
-        assert_eq!(closed.verdict, Verdict::Doubtful, "{}", closed.found);
+        assert_eq!(closed.verdict, Severity::Warning, "{}", closed.found);
         assert!(
             closed.found.contains("no process listens"),
             "{}",

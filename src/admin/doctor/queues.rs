@@ -4,7 +4,7 @@ use std::fs;
 
 use bytesize::ByteSize;
 
-use super::{Area, Check, Verdict};
+use super::{Area, Check, Severity};
 use crate::Config;
 
 const AREA: Area = Area("queues");
@@ -26,7 +26,7 @@ fn queues(config: &Config, available: Option<u64>) -> Check {
     match available {
         Some(available) if available < bytes => AREA.problem(
             CHECK,
-            Verdict::Doubtful,
+            Severity::Warning,
             format!(
                 "{per_agent}, but only {} of memory is available",
                 ByteSize::b(available)
@@ -53,10 +53,10 @@ mod tests {
     #[test]
     fn a_queue_larger_than_available_memory_is_doubtful() {
         let config = Config::for_host("sherpa");
-        assert_eq!(queues(&config, None).verdict, Verdict::Fine);
-        assert_eq!(queues(&config, Some(1 << 30)).verdict, Verdict::Fine);
+        assert_eq!(queues(&config, None).verdict, Severity::Fine);
+        assert_eq!(queues(&config, Some(1 << 30)).verdict, Severity::Fine);
         let small = queues(&config, Some(1 << 20));
-        assert_eq!(small.verdict, Verdict::Doubtful);
+        assert_eq!(small.verdict, Severity::Warning);
         assert!(small.found.contains("64.0 MiB"), "{}", small.found);
     }
 

@@ -2,7 +2,7 @@
 
 use std::time::SystemTime;
 
-use super::{Area, Check, Verdict};
+use super::{Area, Check, Severity};
 use crate::Config;
 
 const AREA: Area = Area("security");
@@ -14,7 +14,7 @@ pub(super) fn examine(now: SystemTime, config: &Config, checks: &mut Vec<Check>)
     } else if config.security.insecure {
         checks.push(AREA.problem(
             KEYS,
-            Verdict::Doubtful,
+            Severity::Warning,
             "there are none, and security.insecure is true: the gateway accepts every host that can \
              reach it, and letters are not encrypted",
             "make keys (`fipa keys init`) and set security.keys, unless every host on this network is \
@@ -32,7 +32,7 @@ pub(super) fn examine(now: SystemTime, config: &Config, checks: &mut Vec<Check>)
 fn keys(_now: SystemTime, _config: &Config, checks: &mut Vec<Check>) {
     checks.push(AREA.problem(
         KEYS,
-        Verdict::Bad,
+        Severity::Bad,
         "security.keys is set, but this program was built without the feature `secure`",
         "build it with the feature, or remove security.keys",
     ));
@@ -54,14 +54,14 @@ fn keys(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
                 }
                 _ => "check the directory in security.keys; `fipa keys list` shows its contents",
             };
-            checks.push(AREA.problem(KEYS, Verdict::Bad, ErrorChain(&error).to_string(), advice));
+            checks.push(AREA.problem(KEYS, Severity::Bad, ErrorChain(&error).to_string(), advice));
             return;
         }
     };
     if credentials.trusted.is_empty() {
         let advice = "trust the certificates of the other hosts: `fipa keys trust FILE`";
         let found = "no other host is trusted, so every connection from another host is refused";
-        checks.push(AREA.problem(KEYS, Verdict::Doubtful, found, advice));
+        checks.push(AREA.problem(KEYS, Severity::Warning, found, advice));
     }
     let mut ending = |name: &str, certificate: &Certificate, whose: Whose| {
         let holding = Holding::at(now, certificate);
@@ -69,8 +69,8 @@ fn keys(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
             return;
         };
         let verdict = match holding {
-            Holding::EndsSoon => Verdict::Doubtful,
-            _ => Verdict::Bad,
+            Holding::EndsSoon => Severity::Warning,
+            _ => Severity::Bad,
         };
         let found = format!("the certificate of {name} {problem}");
         checks.push(AREA.problem(KEYS, verdict, found, advice));
@@ -92,11 +92,11 @@ mod tests {
     use super::*;
     use crate::admin::keys::{Keys, VALID};
 
-    fn verdicts(config: &Config) -> Vec<(Verdict, String)> {
+    fn verdicts(config: &Config) -> Vec<(Severity, String)> {
         verdicts_at(SystemTime::now(), config)
     }
 
-    fn verdicts_at(now: SystemTime, config: &Config) -> Vec<(Verdict, String)> {
+    fn verdicts_at(now: SystemTime, config: &Config) -> Vec<(Severity, String)> {
         let mut checks = Vec::new();
         examine(now, config, &mut checks);
         let verdicts = checks.into_iter().map(|check| (check.verdict, check.found));
@@ -106,13 +106,13 @@ mod tests {
     #[test]
     fn configurations_that_accept_no_host_or_every_host_are_reported() {
         let mut config = Config::for_host("sherpa");
-        assert_eq!(verdicts(&config)[0].0, Verdict::Fine);
+        assert_eq!(verdicts(&config)[0].0, Severity::Fine);
         config.security.insecure = true;
-        assert_eq!(verdicts(&config)[0].0, Verdict::Doubtful);
+        assert_eq!(verdicts(&config)[0].0, Severity::Warning);
         config.security.insecure = false;
         let dir = tempfile::tempdir().unwrap();
         config.security.keys = dir.path().display().to_string();
-        assert_eq!(verdicts(&config)[0].0, Verdict::Bad, "no keys there");
+        assert_eq!(verdicts(&config)[0].0, Severity::Bad, "no keys there");
         let keys = Keys::at(dir.path());
         keys.init(&config.mts.name, &[], VALID).unwrap();
         let found = verdicts(&config);
@@ -125,7 +125,7 @@ mod tests {
             .unwrap();
         let found = verdicts(&config);
         assert_eq!(found.len(), 1);
-        assert_eq!(found[0].0, Verdict::Doubtful);
+        assert_eq!(found[0].0, Severity::Warning);
         assert!(
             found[0].1.contains("crex-mts expires within"),
             "{}",
@@ -135,7 +135,7 @@ mod tests {
         assert!(
             verdicts(&config)
                 .iter()
-                .any(|found| found.0 == Verdict::Bad)
+                .any(|found| found.0 == Severity::Bad)
         );
     }
 
@@ -157,22 +157,22 @@ mod tests {
             [(verdict, found)] => (*verdict, found.clone()),
             found => panic!("{found:?}"),
         };
-        assert_eq!(at(made + 69 * DAY).0, Verdict::Fine);
+        assert_eq!(at(made + 69 * DAY).0, Severity::Fine);
         for days in [71, 99] {
             let (verdict, found) = at(made + days * DAY);
-            assert_eq!(verdict, Verdict::Doubtful, "after {days} days");
+            assert_eq!(verdict, Severity::Warning, "after {days} days");
             assert!(found.contains("crex-mts expires within 30 days"), "{found}");
         }
         let (verdict, found) = at(made + 101 * DAY);
-        assert_eq!(verdict, Verdict::Bad);
+        assert_eq!(verdict, Severity::Bad);
         assert!(found.contains("crex-mts has expired"), "{found}");
         // Keys begin a day before they are made, because clocks differ.
-        assert_eq!(at(made - DAY / 2).0, Verdict::Fine);
+        assert_eq!(at(made - DAY / 2).0, Severity::Fine);
         for wrong in [made - 2 * DAY, SystemTime::UNIX_EPOCH] {
             let found = verdicts_at(wrong, &config);
             assert_eq!(found.len(), 2, "{found:?}");
             for (verdict, found) in found {
-                assert_eq!(verdict, Verdict::Bad);
+                assert_eq!(verdict, Severity::Bad);
                 let cause = "is not valid yet by the clock of this host";
                 assert!(found.contains(cause), "{found}");
             }

@@ -9,7 +9,7 @@ use fipa_transport_shm::{Inspection, ShmConfig, inspect};
 use rustix::fs::inotify;
 use rustix::process::geteuid;
 
-use super::{Area, Check, Verdict};
+use super::{Area, Check, Severity};
 use crate::Config;
 use crate::admin::open_files;
 use crate::domain::files::DomainDir;
@@ -48,7 +48,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         }
         Err(error) => checks.push(AREA.problem(
             "/dev/shm",
-            Verdict::Bad,
+            Severity::Bad,
             ErrorChain(&error).to_string(),
             "mount it (mount -t tmpfs tmpfs /dev/shm), or remove shm from mts.transports",
         )),
@@ -70,9 +70,9 @@ fn size(found: &Inspection, capacity: u64) -> Check {
                   lower transport.shm.capacity";
     // With less space than this no process can start.
     if found.free < 2 << 20 {
-        AREA.problem(CHECK, Verdict::Bad, text, advice)
+        AREA.problem(CHECK, Severity::Bad, text, advice)
     } else if found.free.saturating_add(found.used) < capacity {
-        AREA.problem(CHECK, Verdict::Doubtful, text, advice)
+        AREA.problem(CHECK, Severity::Warning, text, advice)
     } else {
         AREA.fine(CHECK, text)
     }
@@ -96,7 +96,7 @@ fn leftovers(found: &Inspection) -> Check {
     }
     let advice = "start any process of the domain, for example `fipa agents`: it removes the files \
                   within seconds; if they remain, look for processes of the domain that hang";
-    AREA.problem(CHECK, Verdict::Doubtful, text, advice)
+    AREA.problem(CHECK, Severity::Warning, text, advice)
 }
 
 fn exposed(found: &Inspection) -> Check {
@@ -105,7 +105,7 @@ fn exposed(found: &Inspection) -> Check {
         None => AREA.fine(CHECK, "no file of this domain is accessible to other users"),
         Some(file) => AREA.problem(
             CHECK,
-            Verdict::Bad,
+            Severity::Bad,
             format!("{} is accessible to other users", file.display()),
             format!("chmod 600 {}", file.display()),
         ),
@@ -123,8 +123,8 @@ fn descriptors() -> Check {
          {OWN_DESCRIPTORS}, and {DESCRIPTORS_PER_PEER} more for each process that it exchanges letters with"
     );
     match peers {
-        0 => AREA.problem(CHECK, Verdict::Bad, text, advice),
-        few if few < FEW_PEERS => AREA.problem(CHECK, Verdict::Doubtful, text, advice),
+        0 => AREA.problem(CHECK, Severity::Bad, text, advice),
+        few if few < FEW_PEERS => AREA.problem(CHECK, Severity::Warning, text, advice),
         _ => AREA.fine(CHECK, text),
     }
 }
@@ -145,13 +145,13 @@ fn instances_left(limit: u64, one_more: bool) -> Check {
             "all {limit} are in use: a process without one polls the directory of the domain every \
              100 ms"
         );
-        return AREA.problem(CHECK, Verdict::Doubtful, text, advice);
+        return AREA.problem(CHECK, Severity::Warning, text, advice);
     }
     let text = format!("{limit}; every process of this user needs one");
     if limit >= FEW_INSTANCES {
         return AREA.fine(CHECK, text);
     }
-    AREA.problem(CHECK, Verdict::Doubtful, text, advice)
+    AREA.problem(CHECK, Severity::Warning, text, advice)
 }
 
 /// Checks systemd's RemoveIPC; returns `None` if systemd does not run.
@@ -166,7 +166,7 @@ fn remove_ipc(root: &Path, user: u32) -> Option<Check> {
         }
         AREA.problem(
             CHECK,
-            Verdict::Doubtful,
+            Severity::Warning,
             "on: systemd removes the shared memory of this user when the last session ends, even while \
              processes use it",
             "set RemoveIPC=no in /etc/systemd/logind.conf, or run the processes as a system user",
@@ -218,21 +218,21 @@ mod tests {
         fs::create_dir_all(root.join("run/systemd/system")).unwrap();
         fs::create_dir_all(root.join("etc/systemd/logind.conf.d")).unwrap();
         let verdict = |user| remove_ipc(root, user).unwrap().verdict;
-        assert_eq!(verdict(1000), Verdict::Doubtful);
-        assert_eq!(verdict(0), Verdict::Fine);
+        assert_eq!(verdict(1000), Severity::Warning);
+        assert_eq!(verdict(0), Severity::Fine);
         let main = root.join("etc/systemd/logind.conf");
         fs::write(&main, "[Login]\n#RemoveIPC=yes\nRemoveIPC=no\n").unwrap();
-        assert_eq!(verdict(1000), Verdict::Fine);
+        assert_eq!(verdict(1000), Severity::Fine);
         let part = root.join("etc/systemd/logind.conf.d/50-robot.conf");
         fs::write(part, "[Login]\nRemoveIPC=yes\n").unwrap();
-        assert_eq!(verdict(1000), Verdict::Doubtful);
+        assert_eq!(verdict(1000), Severity::Warning);
     }
 
     #[test]
     fn a_lack_of_inotify_instances_names_the_sysctl() {
-        assert_eq!(instances_left(128, true).verdict, Verdict::Fine);
+        assert_eq!(instances_left(128, true).verdict, Severity::Fine);
         for lacking in [instances_left(128, false), instances_left(16, true)] {
-            assert_eq!(lacking.verdict, Verdict::Doubtful);
+            assert_eq!(lacking.verdict, Severity::Warning);
             let advice = lacking.advice.unwrap();
             assert!(advice.contains("fs.inotify.max_user_instances"), "{advice}");
         }
@@ -247,13 +247,13 @@ mod tests {
             ..Inspection::default()
         };
         let verdict = |found| size(&found, 256 << 20).verdict;
-        assert_eq!(verdict(found(1 << 30, 1 << 29, 0)), Verdict::Fine);
-        assert_eq!(verdict(found(64 << 20, 64 << 20, 0)), Verdict::Doubtful);
-        assert_eq!(verdict(found(1 << 30, 1 << 20, 0)), Verdict::Bad);
+        assert_eq!(verdict(found(1 << 30, 1 << 29, 0)), Severity::Fine);
+        assert_eq!(verdict(found(64 << 20, 64 << 20, 0)), Severity::Warning);
+        assert_eq!(verdict(found(1 << 30, 1 << 20, 0)), Severity::Bad);
         // Memory that the domain has taken already counts as usable by it.
         assert_eq!(
             verdict(found(300 << 20, 100 << 20, 200 << 20)),
-            Verdict::Fine
+            Severity::Fine
         );
     }
 
@@ -262,7 +262,7 @@ mod tests {
         let fine = Inspection::default();
         assert_eq!(
             (leftovers(&fine).verdict, exposed(&fine).verdict),
-            (Verdict::Fine, Verdict::Fine)
+            (Severity::Fine, Severity::Fine)
         );
         let found = Inspection {
             dead: 2,
@@ -271,7 +271,7 @@ mod tests {
         };
         assert_eq!(
             (leftovers(&found).verdict, exposed(&found).verdict),
-            (Verdict::Doubtful, Verdict::Bad)
+            (Severity::Warning, Severity::Bad)
         );
         assert!(
             exposed(&found)

@@ -571,7 +571,7 @@ fn replace(path: &Path, new: &Path, bytes: &[u8]) -> io::Result<()> {
 /// a rule is broken.
 #[cfg(feature = "fuzzing")]
 pub(crate) fn play(bytes: &[u8]) {
-    use fipa_platform::{Ams, ApDescription, Df, Now};
+    use fipa_platform::{Ams, ApDescription, Df, PlatformTime};
 
     let Ok((head, items)) = decode(bytes) else {
         return;
@@ -583,7 +583,7 @@ pub(crate) fn play(bytes: &[u8]) {
         drop(contacts.heard(Instant::now(), &contact.name, agent, location));
     }
     let id = fipa_acl::AgentId::new("df@mts").expect("a name");
-    let now = Now {
+    let now = PlatformTime {
         at: Instant::now(),
         wall: std::time::SystemTime::now(),
     };

@@ -489,7 +489,7 @@ impl<P: Protocol> Drop for TimerTask<P> {
 #[cfg(test)]
 mod tests {
     use fipa_acl::Letter;
-    use fipa_transport::{Arrival, AttemptId, Conclusion, Kind, LegacySource, Parcel, Verdict};
+    use fipa_transport::{Arrival, AttemptId, Conclusion, Kind, LegacySource, Parcel, Reaction};
 
     use super::*;
     use crate::udp::Core;
@@ -498,8 +498,8 @@ mod tests {
     struct IgnoringSink;
 
     impl Sink for IgnoringSink {
-        fn arrived(&self, _: Arrival) -> Verdict {
-            Verdict::Later
+        fn arrived(&self, _: Arrival) -> Reaction {
+            Reaction::Later
         }
 
         fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}

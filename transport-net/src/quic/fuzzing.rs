@@ -16,7 +16,7 @@ use bytes::{Bytes, BytesMut};
 use fipa_acl::Letter;
 use fipa_transport::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Incarnation, Introduction,
-    Kind, LegacySource, LoanedContent, Parcel, Sink, Ticket, Verdict,
+    Kind, LegacySource, LoanedContent, Parcel, Reaction, Sink, Ticket,
 };
 use parking_lot::Mutex;
 use quinn::{ConnectionError, ReadError, VarInt};
@@ -247,7 +247,7 @@ impl LoanedContent for Memory {
 }
 
 impl Sink for Recorder {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         let mut state = self.state.lock();
         assert!(state.is_introduced && !state.has_parted);
         if let Body::Letter(letter) = &arrival.parcel.body {
@@ -257,11 +257,11 @@ impl Sink for Recorder {
         let last = state.last_ticket.replace(ticket);
         assert!(last.is_none_or(|last| last.0 < ticket.0), "in order");
         if state.answers {
-            return Verdict::Now(Answer::Accepted);
+            return Reaction::Now(Answer::Accepted);
         }
         state.open.push(ticket);
         assert!(state.open.len() <= MAX_IN_FLIGHT);
-        Verdict::Later
+        Reaction::Later
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {

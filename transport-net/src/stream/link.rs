@@ -912,7 +912,7 @@ impl LinkTask {
                     from,
                     ticket: Some(ticket),
                 });
-                if let fipa_transport::Verdict::Now(answer) = verdict {
+                if let fipa_transport::Reaction::Now(answer) = verdict {
                     let mut state = self.link.state.lock();
                     state.connection.answer(id, &answer, Instant::now());
                 }

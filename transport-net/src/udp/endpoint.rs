@@ -4,7 +4,7 @@ use std::collections::HashSet;
 use std::net::IpAddr;
 use std::time::Instant;
 
-use fipa_transport::{Arrival, Kind, Sink, TransportError, Verdict};
+use fipa_transport::{Arrival, Kind, Reaction, Sink, TransportError};
 
 use super::core::{Core, CoreEvent};
 use crate::datagrams::{Fragments, Path, Protocol, Transmit, WithProtocol};
@@ -90,7 +90,7 @@ impl Protocol for Core {
                     from,
                     ticket: Some(ticket),
                 });
-                if let Verdict::Now(answer) = verdict {
+                if let Reaction::Now(answer) = verdict {
                     with(&mut |core| core.answer(Instant::now(), ticket, &answer));
                 }
             }

@@ -22,8 +22,8 @@ use fipa_testbed::until_some;
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind,
-    LegacySource, LoanedContent, Location, Parcel, Sink, Stream, Ticket, Transport, TransportError,
-    Verdict,
+    LegacySource, LoanedContent, Location, Parcel, Reaction, Sink, Stream, Ticket, Transport,
+    TransportError,
 };
 use fipa_transport_net::{
     Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UnixConfig,
@@ -154,7 +154,7 @@ pub(crate) struct Record {
 
 pub(crate) struct Recorder {
     pub(crate) record: Mutex<Record>,
-    verdict: Verdict,
+    verdict: Reaction,
     /// Bytes of lent memory now and at most, if memory is lent.
     lent: Option<Arc<Mutex<(usize, usize)>>>,
     /// Further locations of every service.
@@ -167,7 +167,7 @@ impl Default for Recorder {
     fn default() -> Self {
         Self {
             record: Mutex::default(),
-            verdict: Verdict::Now(Answer::Accepted),
+            verdict: Reaction::Now(Answer::Accepted),
             lent: None,
             also_at: Mutex::default(),
             refuses_peers: AtomicBool::new(false),
@@ -200,7 +200,7 @@ impl Drop for Lent {
 }
 
 impl Sink for Recorder {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         let Arrival {
             parcel,
             from,
@@ -269,10 +269,10 @@ impl Party {
     }
 
     pub(crate) fn with(config: TcpConfig) -> Self {
-        Self::judging(config, Verdict::Now(Answer::Accepted))
+        Self::judging(config, Reaction::Now(Answer::Accepted))
     }
 
-    pub(crate) fn judging(config: TcpConfig, verdict: Verdict) -> Self {
+    pub(crate) fn judging(config: TcpConfig, verdict: Reaction) -> Self {
         let sink = Recorder {
             verdict,
             ..Recorder::default()

@@ -21,7 +21,7 @@ use rustix::io::Errno;
 
 mod cleanup;
 
-use crate::fork::Owner;
+use crate::fork::OwnerMark;
 use crate::layout::Svc;
 use crate::memory::{is_owned, lock};
 use crate::paths::ProcessPaths;
@@ -66,7 +66,7 @@ pub fn cleanup_dead(config: &ShmConfig) -> Result<Cleaned, ShmError> {
 pub(crate) struct DomainFiles {
     /// Whether this belongs to an endpoint, whose files are removed at the end.
     member: bool,
-    owner: Owner,
+    owner: OwnerMark,
     /// Held by the thread of this process that cleans up.
     cleaning: Mutex<()>,
     /// Whether the endpoint closes: a running cleanup stops, and waits are short.
@@ -93,7 +93,7 @@ impl DomainFiles {
         };
         Ok(Self {
             member: false,
-            owner: Owner::this(),
+            owner: OwnerMark::this(),
             cleaning: Mutex::default(),
             closing: AtomicBool::new(false),
             lock_timed_out: AtomicBool::new(false),
@@ -116,7 +116,7 @@ impl DomainFiles {
         self.clean(true)
     }
 
-    pub(crate) fn owner(&self) -> Owner {
+    pub(crate) fn owner(&self) -> OwnerMark {
         self.owner
     }
 

@@ -14,7 +14,7 @@ use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource, Location,
-    Parcel, Sink, Stream, Transport, TransportErrorKind, Verdict,
+    Parcel, Reaction, Sink, Stream, Transport, TransportErrorKind,
 };
 use fipa_transport_shm::{ShmConfig, ShmTransport};
 use std::sync::{Condvar, Mutex};
@@ -136,10 +136,10 @@ pub(crate) struct RecordingSink {
 }
 
 impl Sink for RecordingSink {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         let mut arrived = self.arrived.lock().unwrap();
         arrived.push((arrival.parcel, arrival.from));
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: LegacySource) {
@@ -201,7 +201,7 @@ impl GatedSink {
 }
 
 impl Sink for GatedSink {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         self.recorded.arrived(arrival)
     }
 

@@ -12,8 +12,8 @@ use super::endpoint::{
     TestEndpoint, accepted, assert_same, concluded, is_accepted, letter, parcel, pattern, until,
 };
 use crate::{
-    Abandoned, Answer, Arrival, AttemptId, Body, Conclusion, Location, Transport,
-    TransportErrorKind, Verdict,
+    Abandoned, Answer, Arrival, AttemptId, Body, Conclusion, Location, Reaction, Transport,
+    TransportErrorKind,
 };
 
 /// An abandoned attempt is concluded once and at once, and other attempts go on.
@@ -26,7 +26,7 @@ pub fn an_abandoned_attempt_is_concluded_at_once(fixture: &dyn Fixture) {
         while !may_answer.load(Ordering::Acquire) {
             std::thread::yield_now();
         }
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     });
     let unknown = a.transport.abandon(AttemptId(77), &b.location);
     assert_eq!(unknown, Abandoned::Unconfirmed, "for an unknown attempt");
@@ -453,7 +453,7 @@ pub fn a_sink_may_call_its_transport(fixture: &dyn Fixture) {
                 .post(attempt, to, arrival.parcel.clone())
                 .expect("it is posted");
         }
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     });
     *relay.lock() = Some((Arc::clone(&b.transport), c.location.clone()));
     for attempt in 0..20 {
@@ -472,7 +472,7 @@ pub fn a_caller_may_hold_a_lock_that_its_sink_takes(fixture: &dyn Fixture) {
         let core = Arc::clone(core);
         move |_: &Arrival| {
             let _held = core.lock();
-            Verdict::Now(Answer::Accepted)
+            Reaction::Now(Answer::Accepted)
         }
     };
     let a = TestEndpoint::with_verdict(fixture, locked(&core));

@@ -11,13 +11,13 @@ use parking_lot::Mutex;
 use super::Fixture;
 use crate::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind,
-    LegacySource, Location, Parcel, Sink, Stream, Ticket, Transport, TransportErrorKind, Verdict,
+    LegacySource, Location, Parcel, Reaction, Sink, Stream, Ticket, Transport, TransportErrorKind,
 };
 
 /// Timeout after which the suite considers a transport broken.
 pub(super) const TIMEOUT: Duration = Duration::from_secs(60);
 
-type VerdictOf = Box<dyn Fn(&Arrival) -> Verdict + Send + Sync>;
+type VerdictOf = Box<dyn Fn(&Arrival) -> Reaction + Send + Sync>;
 
 #[derive(Default)]
 pub(super) struct Record {
@@ -34,7 +34,7 @@ pub(super) struct RecordingSink {
 }
 
 impl Sink for RecordingSink {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
+    fn arrived(&self, arrival: Arrival) -> Reaction {
         let verdict = (self.verdict_of)(&arrival);
         let Arrival {
             parcel,
@@ -76,12 +76,12 @@ pub(super) struct TestEndpoint {
 
 impl TestEndpoint {
     pub(super) fn new(fixture: &dyn Fixture) -> Self {
-        Self::with_verdict(fixture, |_| Verdict::Now(Answer::Accepted))
+        Self::with_verdict(fixture, |_| Reaction::Now(Answer::Accepted))
     }
 
     pub(super) fn with_verdict(
         fixture: &dyn Fixture,
-        verdict_of: impl Fn(&Arrival) -> Verdict + Send + Sync + 'static,
+        verdict_of: impl Fn(&Arrival) -> Reaction + Send + Sync + 'static,
     ) -> Self {
         let transport = fixture.endpoint();
         let sink = Arc::new(RecordingSink {

@@ -11,7 +11,7 @@ use super::endpoint::{
 };
 use crate::{
     Answer, Attempt, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Outcome,
-    Parcel, Report, Stream, TransportError, TransportErrorKind, Verdict,
+    Parcel, Reaction, Report, Stream, TransportError, TransportErrorKind,
 };
 
 /// Letters, reports and credits arrive with all fields unchanged.
@@ -68,7 +68,7 @@ pub fn answers_come_back_as_given(fixture: &dyn Fixture) {
     let given = answers.clone();
     let a = TestEndpoint::new(fixture);
     let b = TestEndpoint::with_verdict(fixture, move |arrival| {
-        Verdict::Now(given[arrival.parcel.sequence as usize].clone())
+        Reaction::Now(given[arrival.parcel.sequence as usize].clone())
     });
     for (index, answer) in answers.into_iter().enumerate() {
         a.send(index as u64, &b, parcel(index as u64, letter("x")));
@@ -79,7 +79,7 @@ pub fn answers_come_back_as_given(fixture: &dyn Fixture) {
     }
     // A long detail is truncated at a character boundary.
     let c = TestEndpoint::with_verdict(fixture, |_| {
-        Verdict::Now(Answer::failed(FailureReason::Refused, "é".repeat(5000)))
+        Reaction::Now(Answer::failed(FailureReason::Refused, "é".repeat(5000)))
     });
     a.send(100, &c, parcel(1, letter("x")));
     match concluded(&[&a, &c], &a, 100) {
@@ -103,7 +103,7 @@ pub fn contradictions_end_a_connection(fixture: &dyn Fixture) {
     let a = TestEndpoint::new(fixture);
     let b = TestEndpoint::with_verdict(fixture, |arrival| {
         let last = arrival.parcel.transfer;
-        Verdict::Now(Answer::OutOfOrder { last })
+        Reaction::Now(Answer::OutOfOrder { last })
     });
     let mut sequence = 0;
     let mut send = |last: u64| {
@@ -174,7 +174,7 @@ pub fn the_sink_has_the_letter_before_it_is_confirmed(fixture: &dyn Fixture) {
 /// Late answers conclude their own parcels in any order.
 pub fn a_late_answer_concludes_its_own_parcel(fixture: &dyn Fixture) {
     let a = TestEndpoint::new(fixture);
-    let b = TestEndpoint::with_verdict(fixture, |_| Verdict::Later);
+    let b = TestEndpoint::with_verdict(fixture, |_| Reaction::Later);
     for attempt in 0..3 {
         a.send(attempt, &b, parcel(attempt, letter("x")));
     }

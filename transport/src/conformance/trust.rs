@@ -16,8 +16,8 @@ use parking_lot::Mutex;
 use super::Fixture;
 use super::endpoint::{TIMEOUT, accepted, parcel};
 use crate::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Kind, LegacySource, Location, Sink, Transport,
-    Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Kind, LegacySource, Location, Reaction, Sink,
+    Transport,
 };
 
 /// An endpoint whose peers prove their identity with certificates.
@@ -45,9 +45,9 @@ struct Record {
 }
 
 impl Sink for Record {
-    fn arrived(&self, _: Arrival) -> Verdict {
+    fn arrived(&self, _: Arrival) -> Reaction {
         *self.arrived.lock() += 1;
-        Verdict::Now(Answer::Accepted)
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 use fipa_acl::escape;
-use fipa_content::{Content, ContentExpression, Dialect, Printer, Profile, Wff};
+use fipa_content::{Content, ContentExpression, Printer, Profile, SlDialect, Wff};
 
 use crate::input;
 use crate::options::Global;
@@ -93,7 +93,7 @@ enum ContentDialect {
     Jade,
 }
 
-impl From<ContentDialect> for Dialect {
+impl From<ContentDialect> for SlDialect {
     fn from(dialect: ContentDialect) -> Self {
         match dialect {
             ContentDialect::Standard => Self::Standard,

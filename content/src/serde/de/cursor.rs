@@ -13,7 +13,7 @@ use crate::number::{self, Decimal, Number};
 use crate::parse::Parser;
 use crate::print::Printer;
 use crate::serde::error::{DeserializeError, DeserializeErrorKind, quoted};
-use crate::{Dialect, MAX_DEPTH};
+use crate::{MAX_DEPTH, SlDialect};
 
 pub(super) struct Deserializer<'de> {
     pub(super) lexer: Lexer<'de>,
@@ -323,8 +323,8 @@ impl<'de> Deserializer<'de> {
         let term = Parser::whole_at(depth, dialect, text, Parser::term)
             .map_err(|error| error.moved(start))?;
         let visited = match dialect {
-            Dialect::Standard => visitor.visit_bytes(text),
-            Dialect::Jade => {
+            SlDialect::Standard => visitor.visit_bytes(text),
+            SlDialect::Jade => {
                 let text = Printer::new()
                     .print(&term)
                     .map_err(|error| DeserializeError::from(error).at(start))?;

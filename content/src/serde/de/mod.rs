@@ -12,7 +12,7 @@ use self::access::{Function, Properties};
 use self::cursor::{Deserializer, Head, out_of_range, unexpected, visit_byte_string, visit_text};
 use super::error::DeserializeError;
 use super::names;
-use crate::Dialect;
+use crate::SlDialect;
 use crate::chars::truth;
 use crate::lex::{Lexer, Token};
 
@@ -28,7 +28,7 @@ const TERM: &str = "FIPA00008 Term";
 /// # Errors
 /// When the bytes are not one term, or the term is not a value of the type.
 pub fn from_slice<'de, T: Deserialize<'de>>(bytes: &'de (impl AsRef<[u8]> + ?Sized)) -> Result<T> {
-    from_slice_in(Dialect::Standard, bytes)
+    from_slice_in(SlDialect::Standard, bytes)
 }
 
 /// Reads one term that comes from a writer of this dialect as a value.
@@ -36,7 +36,7 @@ pub fn from_slice<'de, T: Deserialize<'de>>(bytes: &'de (impl AsRef<[u8]> + ?Siz
 /// # Errors
 /// See [`from_slice`].
 pub fn from_slice_in<'de, T: Deserialize<'de>>(
-    dialect: Dialect,
+    dialect: SlDialect,
     bytes: &'de (impl AsRef<[u8]> + ?Sized),
 ) -> Result<T> {
     let mut deserializer = Deserializer::new(Lexer::new(bytes.as_ref(), dialect));

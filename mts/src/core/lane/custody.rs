@@ -15,7 +15,7 @@ use super::super::origin::{Settlement, Upstream};
 use super::super::rules::{self, AttemptEnd, Cause, HoldDecision};
 use super::super::work;
 use super::Lane;
-use super::delivery::{Delivery, Holding, State};
+use super::delivery::{Holding, OpenLetter, State};
 use super::pause::PauseEnd;
 use super::turns::Pace;
 
@@ -313,7 +313,7 @@ impl LettersLeft {
     }
 
     /// Records a letter that leaves. The hand-over that has delivered it did not come back, and counts, too.
-    pub(super) fn push(&mut self, now: Instant, delivery: &Delivery, delivered: bool) {
+    pub(super) fn push(&mut self, now: Instant, delivery: &OpenLetter, delivered: bool) {
         if self.latest.len() >= MAX_LEFT
             && let Some((sequence, pace)) = self.latest.pop_front()
         {

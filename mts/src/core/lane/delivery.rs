@@ -24,7 +24,7 @@ const MAX_HANDED: usize = 16;
 
 /// The delivery of one letter to one receiver.
 #[derive(Debug)]
-pub(crate) struct Delivery {
+pub(crate) struct OpenLetter {
     pub(crate) origin: Origin,
     pub(crate) letter: Letter,
     pub(crate) sequence: u64,
@@ -128,7 +128,7 @@ impl State {
     }
 }
 
-impl Delivery {
+impl OpenLetter {
     /// Creates a delivery for this registration of its receiver.
     pub(crate) fn new(
         now: Instant,

@@ -35,7 +35,7 @@ use fipa_transport::{
 };
 
 use self::custody::LettersLeft;
-pub(crate) use self::delivery::Delivery;
+pub(crate) use self::delivery::OpenLetter;
 use self::delivery::State;
 use self::pause::Pause;
 pub(crate) use self::pause::PauseEnd;
@@ -90,7 +90,7 @@ pub(crate) struct Lane {
     /// The location that the receiver stated itself, if it is not in the directory.
     stated: Option<Arc<Entry>>,
     /// In boxes, because letters enter and leave in the middle.
-    letters: VecDeque<Box<Delivery>>,
+    letters: VecDeque<Box<OpenLetter>>,
     /// Number of letters that were pushed since the lane was empty.
     pushed: u64,
     bytes: usize,
@@ -220,7 +220,7 @@ impl Lane {
         matches!(self.key, LaneKey::Custody(_))
     }
 
-    fn stream_of(&self, delivery: &Delivery) -> Stream {
+    fn stream_of(&self, delivery: &OpenLetter) -> Stream {
         let realm = match self.key {
             LaneKey::Custody(stream) => stream.realm,
             LaneKey::Name(..) | LaneKey::Service(_) => Realm::UNPROVED,
@@ -340,7 +340,7 @@ impl Lane {
     }
 
     /// Inserts a letter at its position in the order.
-    pub(crate) fn push(&mut self, mut delivery: Box<Delivery>, table: &mut AttemptTable) {
+    pub(crate) fn push(&mut self, mut delivery: Box<OpenLetter>, table: &mut AttemptTable) {
         delivery.position = self.pushed;
         self.pushed += 1;
         let len = delivery.letter.len();
@@ -896,7 +896,7 @@ mod tests {
     /// than 256 bytes.
     #[test]
     fn the_state_of_a_letter_takes_no_more_memory_than_it_counts_as() {
-        let state = size_of::<Delivery>();
+        let state = size_of::<OpenLetter>();
         assert!(2 * state + 256 <= LETTER_BYTES, "{state} bytes");
         // A queue has room for at least four letters.
         let state = size_of::<Lane>() + 4 * state + 512;

@@ -170,7 +170,7 @@ mod tests {
     use fipa_acl::Letter;
     use fipa_testbed::until;
     use fipa_transport::{
-        Arrival, AttemptId, Conclusion, Incarnation, Location, TransportErrorKind, Verdict,
+        Arrival, AttemptId, Conclusion, Incarnation, Location, Reaction, TransportErrorKind,
     };
     use parking_lot::Mutex;
 
@@ -181,8 +181,8 @@ mod tests {
     struct ConclusionSink(Mutex<Vec<(AttemptId, Conclusion)>>);
 
     impl Sink for ConclusionSink {
-        fn arrived(&self, _: Arrival) -> Verdict {
-            Verdict::Later
+        fn arrived(&self, _: Arrival) -> Reaction {
+            Reaction::Later
         }
 
         fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}

@@ -4,7 +4,7 @@
 use std::net::SocketAddr;
 
 use fipa_acl::Letter;
-use fipa_transport::{Answer, Arrival, Conclusion, Stream, Verdict};
+use fipa_transport::{Answer, Arrival, Conclusion, Reaction, Stream};
 
 use super::super::frame::FrameReader;
 use super::super::link::LinkTask;
@@ -16,8 +16,8 @@ use crate::Identity;
 struct Ignores;
 
 impl Sink for Ignores {
-    fn arrived(&self, _: Arrival) -> Verdict {
-        Verdict::Now(Answer::Accepted)
+    fn arrived(&self, _: Arrival) -> Reaction {
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: fipa_transport::LegacySource) {}
@@ -586,8 +586,8 @@ async fn a_question_ends_early_after_its_peer_has_announced_another_address() {
 struct Errors(Mutex<Option<TransportError>>);
 
 impl Sink for Errors {
-    fn arrived(&self, _: Arrival) -> Verdict {
-        Verdict::Now(Answer::Accepted)
+    fn arrived(&self, _: Arrival) -> Reaction {
+        Reaction::Now(Answer::Accepted)
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: fipa_transport::LegacySource) {}
