@@ -77,7 +77,7 @@ impl Access {
 
     /// Whether the sender may send one more letter from the process with this number.
     pub fn may_send(&mut self, source: u64, sender: &str, now: Instant) -> bool {
-        let source = fipa_mts::Source::Process(Incarnation::from_u64(source));
+        let source = fipa_mts::LetterSource::Process(Incarnation::from_u64(source));
         self.0.count(source, sender, now).is_ok()
     }
 }

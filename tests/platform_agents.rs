@@ -12,7 +12,7 @@ use fipa::platform::{
     AgentDescription, AmsDescription, Df, Exception, PlatformError, ServiceDescription, limits,
 };
 use fipa::{AgentId, Config, Domain, Gateway, Kind, Message, Performative, Reach, Time, blocking};
-use fipa_sds::{Directory as _, EXCHANGE_ONTOLOGY, MdnsConfig, MdnsDirectory, Mts, Registration};
+use fipa_sds::{Directory as _, EXCHANGE_ONTOLOGY, MdnsConfig, MdnsDirectory, MtsId, Registration};
 use fipa_testbed::until_async;
 use fipa_transport::Incarnation;
 use stranger::Stranger;
@@ -572,7 +572,7 @@ async fn an_announcement_by_mdns_takes_no_name_of_a_gateways_agents() {
     let own = gateway.name().to_owned();
     let namesake = MdnsDirectory::open(MdnsConfig {
         interfaces: vec!["lo".to_owned()],
-        ..MdnsConfig::new(Mts::new(&*own, Incarnation::random()))
+        ..MdnsConfig::new(MtsId::new(&*own, Incarnation::random()))
     });
     let namesake = namesake.unwrap();
     let at: fipa::Location = "tcp://127.0.0.1:9".parse().unwrap();

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa::{Config, Domain, Entry, Incarnation, Location, Matcher, Query, Reach, Role, Source};
-use fipa_sds::{HostConfig, HostDirectory, Mts};
+use fipa_sds::{HostConfig, HostDirectory, MtsId};
 use fipa_testbed::{ChildGuard, ignored_test};
 
 const AGENTS: usize = 1000;
@@ -234,7 +234,7 @@ fn remote_agents(count: usize) -> Vec<Arc<Entry>> {
             agent_type: "gripper".to_owned(),
             incarnation: Incarnation::random(),
             locations: vec![at.clone()],
-            mts: Mts::new(
+            mts: MtsId::new(
                 format!("robot-{peer}-mts"),
                 Incarnation::from_u64(peer as u64 + 1),
             ),
@@ -261,7 +261,7 @@ async fn a_process_that_publishes_agents_of_other_hosts() {
     let gateway = HostDirectory::open(HostConfig {
         brief: false,
         dir: std::path::Path::new(&run).join(&name).join("directory"),
-        mts: Mts::new("gateway", Incarnation::random()),
+        mts: MtsId::new("gateway", Incarnation::random()),
         gateway: true,
     });
     let gateway = gateway.unwrap();

@@ -18,8 +18,8 @@ use std::sync::Arc;
 
 use criterion::{Criterion, criterion_group};
 use fipa_sds::{
-    Change, Directory, Exchange, HostConfig, HostDirectory, MemoryDirectory, MergedDirectory, Mts,
-    Query, Registration, StaticDirectory, resolve,
+    Change, Directory, Exchange, HostConfig, HostDirectory, MemoryDirectory, MergedDirectory,
+    MtsId, Query, Registration, StaticDirectory, resolve,
 };
 use fipa_transport::Incarnation;
 
@@ -47,7 +47,7 @@ fn registration(number: usize) -> Registration {
 
 /// The view of a gateway: several back ends, one of which has all entries.
 fn directory() -> (Arc<MemoryDirectory>, MergedDirectory) {
-    let memory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));
+    let memory = MemoryDirectory::new(MtsId::new("mts", Incarnation::random()));
     for number in 0..ENTRIES {
         memory.register(registration(number)).unwrap();
     }
@@ -107,7 +107,7 @@ fn on_one_host(criterion: &mut Criterion) {
         let config = HostConfig {
             brief: false,
             dir: place.path().join("run"),
-            mts: Mts::new(mts, Incarnation::random()),
+            mts: MtsId::new(mts, Incarnation::random()),
             gateway: false,
         };
         HostDirectory::open(config).unwrap()

@@ -10,7 +10,7 @@ use bytes::Bytes;
 use fipa_acl::{Envelope, Letter};
 use fipa_mts::core::{News, Notice, SubmissionId};
 use fipa_mts::watch::record::{MAX_CONTENT, MAX_LEN, RecordBody, Wish, of};
-use fipa_mts::watch::{Event, Joiner, Record, Source};
+use fipa_mts::watch::{Event, Joiner, Record, RecordSource};
 use fipa_transport::{Incarnation, Stream};
 use libfuzzer_sys::fuzz_target;
 
@@ -26,7 +26,7 @@ fuzz_target!(|bytes: &[u8]| {
     let (envelope, payload) = (whole.slice(..envelope_len), whole.slice(envelope_len..));
     written_records_are_accepted(&Letter::new(envelope, payload));
     let mut joiner = Joiner::new();
-    joiner.handle_begin(Source(0), "arm_2");
+    joiner.handle_begin(RecordSource(0), "arm_2");
     let mut now = Instant::now();
     let mut reported = HashSet::new();
     let mut rest = bytes;
@@ -36,7 +36,7 @@ fuzz_target!(|bytes: &[u8]| {
         let (record, after) = after.split_at(len);
         rest = after;
         number += 1;
-        let source = Source(number % 3);
+        let source = RecordSource(number % 3);
         // A record of kind 0 stays unchanged. Other records get a valid header.
         let record = match kind {
             0 => record.to_vec(),

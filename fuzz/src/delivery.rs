@@ -22,7 +22,7 @@ use bytes::Bytes;
 use fipa_acl::{AgentId, Envelope, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, SubmissionId, Unframed};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
+use fipa_sds::{Directory, Entry, MtsId, Reach, Role, Source, Subscriber};
 use fipa_transport::{
     Answer, Arrival, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation,
     Introduction, Kind, LegacySource, Location, Mandate, Outcome, Parcel, Principal, Reaction,
@@ -139,7 +139,7 @@ fn view(of: Incarnation) -> View {
             agent_type: String::new(),
             incarnation,
             locations: vec![location],
-            mts: Mts::new("mts", mts),
+            mts: MtsId::new("mts", mts),
             description: String::new(),
             registered: SystemTime::UNIX_EPOCH,
             source: Source::Host,

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_sds::{Directory, Entry, Exchange, Mts, OwnDfEntry, Present, Reach, Role, Source};
+use fipa_sds::{Directory, Entry, Exchange, MtsId, OwnDfEntry, Present, Reach, Role, Source};
 use fipa_transport::{Incarnation, Location};
 
 use crate::input::Input;
@@ -33,7 +33,7 @@ fn agent(name: &str, incarnation: u64, gateway: Incarnation) -> Arc<Entry> {
         agent_type: "robot".into(),
         incarnation: Incarnation::from_u64(incarnation),
         locations: vec![location(gateway)],
-        mts: Mts::new("mts", gateway),
+        mts: MtsId::new("mts", gateway),
         description: String::new(),
         registered: SystemTime::UNIX_EPOCH,
         source: Source::Host,
@@ -71,7 +71,7 @@ pub fn play(bytes: &[u8]) {
     let gateways = |with: &[Incarnation]| -> Vec<Present> {
         let all = with
             .iter()
-            .map(|one| Present::unproved(Mts::new("mts", *one), vec![location(*one)]));
+            .map(|one| Present::unproved(MtsId::new("mts", *one), vec![location(*one)]));
         all.collect()
     };
     let mut present = vec![HONEST, LIARS[0], LIARS[1], LIARS[2]];

@@ -8,7 +8,7 @@ use std::net::IpAddr;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_sds::fuzzing::{Listener, announced};
-use fipa_sds::{Entry, Members, Mts, Reach, Role, Source};
+use fipa_sds::{Entry, Members, MtsId, Reach, Role, Source};
 use fipa_transport::Incarnation;
 
 use crate::input::Input;
@@ -68,7 +68,7 @@ fn entry(input: &mut Input<'_>) -> Entry {
         agent_type: text(input),
         incarnation: Incarnation::from_u64(input.number()),
         locations: vec![location.parse().expect("a location")],
-        mts: Mts::new(text(input), gateway),
+        mts: MtsId::new(text(input), gateway),
         description: text(input),
         registered: SystemTime::UNIX_EPOCH + input.time().min(Duration::from_secs(10_000)),
         source: Source::Mdns,

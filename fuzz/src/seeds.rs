@@ -4,7 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::time::SystemTime;
 
-use fipa_sds::{Entry, Mts, Reach, Role, Source};
+use fipa_sds::{Entry, MtsId, Reach, Role, Source};
 use fipa_transport::Incarnation;
 use fipa_transport_net::fuzzing::parcel_body as written;
 
@@ -86,7 +86,7 @@ fn entry(role: Role) -> Entry {
         agent_type: "gripper".into(),
         incarnation: gateway,
         locations: vec!["tcp://192.0.2.7:7788".parse().expect("a location")],
-        mts: Mts::new("arm-mts", gateway),
+        mts: MtsId::new("arm-mts", gateway),
         description: "left".into(),
         registered: SystemTime::UNIX_EPOCH,
         source: Source::Mdns,

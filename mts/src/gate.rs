@@ -15,13 +15,13 @@ pub struct Link {
     /// peer. Only on a [host-local](Kind::is_host_local) link is that a process of this user.
     pub service: Incarnation,
     /// The party that sent the letter, as far as the link proves it.
-    pub source: Source,
+    pub source: LetterSource,
 }
 
 /// The party at the other end of a link, as far as the link proves it. Quotas count letters by
 /// source, and ignore the names in the letters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Source {
+pub enum LetterSource {
     /// The service with this incarnation in a process of this user on this host.
     Process(Incarnation),
     /// The services with the key of the certificate with this SHA-256 fingerprint.
@@ -31,7 +31,7 @@ pub enum Source {
     Address(Option<IpAddr>),
 }
 
-impl Source {
+impl LetterSource {
     /// Returns the source of letters from this service.
     #[must_use]
     pub fn of(hop: &Hop) -> Self {
@@ -99,10 +99,10 @@ pub trait AccessGate: Send + Sync {
 mod tests {
     use super::*;
 
-    fn source(location: &str, principal: Principal) -> Source {
+    fn source(location: &str, principal: Principal) -> LetterSource {
         let location: Location = location.parse().unwrap();
         let location = location.with_incarnation(Incarnation::from_u64(7));
-        Source::of(&Hop {
+        LetterSource::of(&Hop {
             location,
             principal,
         })
@@ -111,7 +111,7 @@ mod tests {
     #[test]
     fn a_source_is_what_the_link_proves() {
         let unproved = |location| source(location, Principal::Unproved);
-        let at = |ip: &str| Source::at(ip.parse().unwrap());
+        let at = |ip: &str| LetterSource::at(ip.parse().unwrap());
         assert_eq!(unproved("tcp://192.0.2.1:7"), at("192.0.2.1"));
         assert_eq!(unproved("udp://192.0.2.1:8"), at("192.0.2.1"));
         // A host has many addresses in one network.
@@ -124,6 +124,6 @@ mod tests {
             source("quic://192.0.2.9:7", key)
         );
         let process = source("shm://here", Principal::Host);
-        assert_eq!(process, Source::Process(Incarnation::from_u64(7)));
+        assert_eq!(process, LetterSource::Process(Incarnation::from_u64(7)));
     }
 }

@@ -22,7 +22,7 @@ type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
 type Set<K> = std::collections::HashSet<K, foldhash::fast::RandomState>;
 
 pub use failure::DeliveryFailure;
-pub use gate::{AccessGate, LetterParts, Link, Source};
+pub use gate::{AccessGate, LetterParts, LetterSource, Link};
 pub use post::{LetterDraft, PostError, letter_by, letter_for};
 pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};
 pub use stamp::stamped_peer;

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
+use fipa_sds::{Directory, Entry, MtsId, Reach, Role, Source, Subscriber};
 use fipa_transport::{
     Answer, Arrival, Conclusion, Hop, Incarnation, Kind, Parcel, Principal, Reaction,
 };
@@ -50,7 +50,7 @@ fn entry(name: &str, incarnation: Incarnation, at: &str) -> Entry {
         agent_type: String::new(),
         incarnation,
         locations: vec![at.parse().unwrap()],
-        mts: Mts::new("mts", PROCESS),
+        mts: MtsId::new("mts", PROCESS),
         description: String::new(),
         registered: SystemTime::UNIX_EPOCH,
         source: Source::Host,

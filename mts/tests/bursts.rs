@@ -14,7 +14,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, SubmissionId};
 use fipa_mts::{AccessGate, LetterParts, Link, letter_for};
-use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Reach, Registration, View};
+use fipa_sds::{Directory, Entry, MemoryDirectory, MtsId, Reach, Registration, View};
 use fipa_transport::{
     Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location, Outcome,
     Parcel, Principal, Reaction, Ticket, TransportError, TransportErrorKind,
@@ -196,7 +196,7 @@ impl Path {
     }
 
     fn service(at: usize, streams: usize, start: Instant) -> Service {
-        let directory = MemoryDirectory::new(Mts::new("mts", service(at)));
+        let directory = MemoryDirectory::new(MtsId::new("mts", service(at)));
         for stream in 0..streams {
             let locations = match at {
                 RECEIVER => Vec::new(),

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, AttemptId, Conclusion, Incarnation, Kind, Outcome, TransportError, TransportErrorKind,
 };
@@ -18,7 +18,7 @@ const WINDOW: usize = 16;
 #[test]
 fn only_an_attempt_that_ended_frees_room() {
     let own = Incarnation::from_u64(1);
-    let directory = MemoryDirectory::new(Mts::new("mts", own));
+    let directory = MemoryDirectory::new(MtsId::new("mts", own));
     let location: fipa_transport::Location =
         "shm://0000000000000009#0000000000000009".parse().unwrap();
     for number in 0..RECEIVERS {
@@ -91,7 +91,7 @@ fn only_an_attempt_that_ended_frees_room() {
 #[test]
 fn a_full_lane_that_moves_holds_letters_back() {
     let own = Incarnation::from_u64(1);
-    let directory = MemoryDirectory::new(Mts::new("mts", own));
+    let directory = MemoryDirectory::new(MtsId::new("mts", own));
     let location = "shm://0000000000000009#0000000000000009".parse().unwrap();
     let arm = Registration::new("arm", Incarnation::from_u64(100), vec![location]);
     directory.register(arm).unwrap();

@@ -133,7 +133,7 @@ impl Gateway {
             tap: None,
             gate: None,
         };
-        let directory = MemoryDirectory::new(fipa_sds::Mts::new("mts", Incarnation::from_u64(2)));
+        let directory = MemoryDirectory::new(fipa_sds::MtsId::new("mts", Incarnation::from_u64(2)));
         for number in 0..AGENTS {
             let at = "tcp://127.0.0.1:9#0000000000000002".parse().unwrap();
             let agent = Incarnation::from_u64(100 + number);

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
-use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Reach, Registration, View};
+use fipa_sds::{Directory, Entry, MemoryDirectory, MtsId, Reach, Registration, View};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
     Outcome, Parcel, Principal, Reaction, Report, Stream, TransportError, TransportErrorKind,
@@ -44,7 +44,7 @@ impl Service {
     }
 
     fn with_view(forwards: bool, view: impl FnOnce(Arc<MemoryDirectory>) -> Arc<dyn View>) -> Self {
-        let directory = Arc::new(MemoryDirectory::new(Mts::new("mts", NEXT)));
+        let directory = Arc::new(MemoryDirectory::new(MtsId::new("mts", NEXT)));
         let at = shm(NEXT);
         directory
             .register(Registration::new("arm", ARM, vec![at]))

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, Unframed};
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
     LegacySource, Location, Outcome, Parcel, Principal, Reaction, Report, Signature, Stream,
@@ -45,7 +45,7 @@ struct Gateway {
 impl Gateway {
     /// A gateway whose directory has one agent, `arm`, in a process of its host.
     fn new(forwards: bool) -> Self {
-        let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(0x9)));
+        let directory = MemoryDirectory::new(MtsId::new("process", Incarnation::from_u64(0x9)));
         let arm = Registration::new("arm", ARM, vec![shm(0x9)]);
         directory.register(arm).unwrap();
         let order = vec![Kind::Shm, Kind::Tcp];
@@ -303,7 +303,7 @@ fn a_forwarded_letter_is_stamped_and_a_returning_one_is_a_loop() {
     // A stamp of another gateway with the same name is not a loop.
     let mut namesake = Gateway::new(true);
     let order = vec![Kind::Shm];
-    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(0x9)));
+    let directory = MemoryDirectory::new(MtsId::new("process", Incarnation::from_u64(0x9)));
     directory
         .register(Registration::new("arm", ARM, vec![shm(0x9)]))
         .unwrap();
@@ -396,7 +396,7 @@ fn a_legacy_peers_letter_goes_to_the_receiver_in_its_envelope() {
 
 #[test]
 fn a_failed_route_is_avoided_during_its_backoff() {
-    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(0x9)));
+    let directory = MemoryDirectory::new(MtsId::new("process", Incarnation::from_u64(0x9)));
     directory
         .register(Registration::new("arm", ARM, vec![shm(0x9), tcp(0x9)]))
         .unwrap();

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now};
-use fipa_mts::{AccessGate, LetterParts, Link, Source, letter_for};
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_mts::{AccessGate, LetterParts, Link, LetterSource, letter_for};
+use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal,
     Reaction, Stream,
@@ -36,7 +36,7 @@ impl AccessGate for Guarded {
     ) -> Result<(), String> {
         assert_eq!(link.via, Kind::Shm);
         assert_eq!(link.service, Incarnation::from_u64(1), "the other end");
-        assert_eq!(link.source, Source::Process(Incarnation::from_u64(1)));
+        assert_eq!(link.source, LetterSource::Process(Incarnation::from_u64(1)));
         self.0.lock().push(receiver.to_owned());
         match receiver {
             "brake" => Err("hands off".to_owned()),
@@ -94,7 +94,7 @@ fn config(forwards: bool) -> CoreConfig {
 #[test]
 fn the_gate_is_called_once_per_letter_and_only_when_there_is_room() {
     let gate = Arc::new(Guarded::default());
-    let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(7)));
+    let directory = MemoryDirectory::new(MtsId::new("mts", Incarnation::from_u64(7)));
     let mut core = Core::new(config(false), Arc::new(directory)).gated(gate.clone());
     core.register("arm".into(), ARM);
     core.register("brake".into(), BRAKE);
@@ -115,7 +115,7 @@ fn the_gate_is_called_once_per_letter_and_only_when_there_is_room() {
 #[test]
 fn a_gateway_calls_the_gate_with_the_registered_name() {
     let gate = Arc::new(Guarded::default());
-    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(9)));
+    let directory = MemoryDirectory::new(MtsId::new("process", Incarnation::from_u64(9)));
     for (name, life) in [("arm", ARM), ("brake", BRAKE)] {
         let at = "shm://9#0000000000000009".parse().unwrap();
         let agent = Registration::new(name, life, vec![at]);

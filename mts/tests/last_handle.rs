@@ -77,7 +77,7 @@ fn no_transport_is_closed_from_within_a_call_of_its_own() {
         gate: None,
     };
     let own = Incarnation::from_u64(1);
-    let directory = MemoryDirectory::new(fipa_sds::Mts::new("mts", own));
+    let directory = MemoryDirectory::new(fipa_sds::MtsId::new("mts", own));
     let core = CoreConfig::new("mts", own, vec![Kind::Shm]);
     let transports: Vec<Arc<dyn Transport>> = vec![transport.clone()];
     let directory = Arc::new(directory);

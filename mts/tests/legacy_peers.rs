@@ -12,7 +12,7 @@ use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Represe
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Submission, Undecodable, Unframed};
 use fipa_mts::{AccessGate, LetterParts, Link, letter_for};
 use fipa_sds::{
-    ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration,
+    ContactDirectory, Directory, MemoryDirectory, MergedDirectory, MtsId, Registration,
     StaticDirectory,
 };
 use fipa_transport::{
@@ -245,7 +245,7 @@ impl AccessGate for Refusing {
 #[test]
 fn a_refused_sender_gets_failure_messages_in_its_dialect_at_a_limited_rate() {
     // The receiver of the recorded letter is on this host.
-    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(9)));
+    let directory = MemoryDirectory::new(MtsId::new("process", Incarnation::from_u64(9)));
     let at = "shm://9#0000000000000009".parse().unwrap();
     let echo = Registration::new("echo", Incarnation::from_u64(5), vec![at]);
     directory.register(echo).unwrap();
@@ -488,7 +488,7 @@ fn the_sender_of_a_framed_letter_that_cannot_be_decoded_gets_a_failure_message()
 
 /// The directory of a host on which one agent is registered.
 fn host_of(agent: &str) -> Arc<dyn Directory> {
-    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(9)));
+    let directory = MemoryDirectory::new(MtsId::new("process", Incarnation::from_u64(9)));
     let at = "shm://9#0000000000000009".parse().unwrap();
     let agent = Registration::new(agent, Incarnation::from_u64(5), vec![at]);
     directory.register(agent).unwrap();

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Unframed};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, LegacySource, Parcel, Principal,
     Reaction, Signature, Stream,
@@ -32,7 +32,7 @@ fn now() -> Now {
 /// A core with the agent `arm`: in its own process, or of another process whose letters it forwards.
 fn core(forwards: bool) -> Core {
     let own = Incarnation::from_u64(7);
-    let directory = MemoryDirectory::new(Mts::new("mts", own));
+    let directory = MemoryDirectory::new(MtsId::new("mts", own));
     if forwards {
         let at = "shm://9#0000000000000009".parse().unwrap();
         let registration = Registration::new("arm", ARM, vec![at]);
@@ -160,7 +160,7 @@ fn letters_of_legacy_peers_with_misleading_names_are_refused() {
     for (letter, _) in misleading() {
         let mut core = core(false);
         let here = Registration::new("arm", ARM, Vec::new());
-        let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(7)));
+        let directory = MemoryDirectory::new(MtsId::new("mts", Incarnation::from_u64(7)));
         directory.register(here).unwrap();
         let mut unframed = Unframed::read(letter, Kind::Tcp, PEER, &directory).unwrap();
         core.handle_unframed(now(), Duration::from_secs(5), &mut unframed);
@@ -171,7 +171,7 @@ fn letters_of_legacy_peers_with_misleading_names_are_refused() {
         assert!(heard.next().is_none(), "the sender is no contact");
     }
     let mut core = core(false);
-    let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(7)));
+    let directory = MemoryDirectory::new(MtsId::new("mts", Incarnation::from_u64(7)));
     let here = Registration::new("arm", ARM, Vec::new());
     directory.register(here).unwrap();
     let clean = letter(&message("rover", "arm", "rover"));

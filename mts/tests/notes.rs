@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_mts::core::{Action, Core, CoreConfig, MAX_DEADLINE, Now};
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind, Location,
     Mandate, Parcel, Principal, Reaction, Stream, TransportError, TransportErrorKind,
@@ -30,7 +30,7 @@ struct Gateway {
 
 impl Gateway {
     fn new() -> Self {
-        let directory = MemoryDirectory::new(Mts::new("process", PROCESS));
+        let directory = MemoryDirectory::new(MtsId::new("process", PROCESS));
         let at = Location::new(Kind::Shm, &PROCESS.to_string()).unwrap();
         let at = at.with_incarnation(PROCESS);
         let arm = Registration::new("arm", ARM, vec![at]);

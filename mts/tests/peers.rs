@@ -8,7 +8,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Peer, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
+use fipa_sds::{Directory as _, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind, Location, Mandate,
     Principal, TransportError, TransportErrorKind,
@@ -22,7 +22,7 @@ struct Bench {
 impl Bench {
     fn new() -> Self {
         let incarnation = Incarnation::from_u64(1);
-        let directory = MemoryDirectory::new(Mts::new("mts", incarnation));
+        let directory = MemoryDirectory::new(MtsId::new("mts", incarnation));
         let config = CoreConfig::new("mts", incarnation, vec![Kind::Udp, Kind::Tcp]);
         Self {
             core: Core::new(config, Arc::new(directory)),
@@ -252,7 +252,7 @@ fn a_greeting_opens_a_connection_and_is_not_repeated() {
 #[test]
 fn waiting_letters_leave_when_their_receiver_is_reachable_again() {
     let gateway = Incarnation::from_u64(7);
-    let directory = Arc::new(MemoryDirectory::new(Mts::new(
+    let directory = Arc::new(MemoryDirectory::new(MtsId::new(
         "mts",
         Incarnation::from_u64(1),
     )));

@@ -12,7 +12,7 @@ use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{
-    ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration, Role,
+    ContactDirectory, Directory, MemoryDirectory, MergedDirectory, MtsId, Registration, Role,
 };
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
@@ -76,7 +76,7 @@ impl Bench {
 
     /// The same, with the process of `arm` at this address.
     fn with_process(agents: &[(&str, Incarnation, Incarnation)], process: &str) -> Self {
-        let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+        let own = Arc::new(MemoryDirectory::new(MtsId::new("mts", PROCESS)));
         let arm = vec![at(PROCESS, process)];
         own.register(Registration::new("arm", ARM, arm)).unwrap();
         let contacts = Arc::new(ContactDirectory::new());
@@ -546,7 +546,7 @@ fn only_the_service_that_handed_a_letter_over_lowers_its_predecessor() {
     let mut bench = Bench::new();
     let camera = Incarnation::from_u64(50);
     let listed = vec![at(PROCESS, "tcp://127.0.0.1:9")];
-    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+    let own = Arc::new(MemoryDirectory::new(MtsId::new("mts", PROCESS)));
     own.register(Registration::new("camera", camera, listed.clone()))
         .unwrap();
     own.register(Registration::new("arm", ARM, listed)).unwrap();
@@ -568,7 +568,7 @@ fn only_the_service_that_handed_a_letter_over_lowers_its_predecessor() {
 #[test]
 fn no_other_host_is_a_service_that_this_host_lists() {
     let mut bench = Bench::new();
-    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", GATEWAY)));
+    let own = Arc::new(MemoryDirectory::new(MtsId::new("mts", GATEWAY)));
     let mut gateway = Registration::new("mts", GATEWAY, vec![at(GATEWAY, "shm://mts")]);
     gateway.role = Role::Gateway;
     own.register(gateway).unwrap();
@@ -588,7 +588,7 @@ fn no_other_host_is_a_service_that_this_host_lists() {
 
 #[test]
 fn letters_that_one_receiver_leaves_in_custody_do_not_use_up_the_room_of_others() {
-    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+    let own = Arc::new(MemoryDirectory::new(MtsId::new("mts", PROCESS)));
     for (name, agent) in [("arm", ARM), ("lamp", LAMP)] {
         let location = vec![at(PROCESS, "shm://arms")];
         own.register(Registration::new(name, agent, location))
@@ -621,7 +621,7 @@ fn invent(bench: &mut Bench, senders: std::ops::Range<u64>) -> Vec<Reaction> {
 /// Each sender has a lane, whose state takes more memory than a small letter.
 #[test]
 fn letters_of_invented_senders_take_bounded_memory() {
-    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+    let own = Arc::new(MemoryDirectory::new(MtsId::new("mts", PROCESS)));
     let location = vec![at(PROCESS, "shm://arms")];
     own.register(Registration::new("arm", ARM, location))
         .unwrap();
@@ -670,7 +670,7 @@ fn a_peer_that_invents_senders_makes_few_of_them_known() {
 /// The state of a small letter takes more memory than its bytes.
 #[test]
 fn small_letters_take_bounded_memory() {
-    let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+    let own = Arc::new(MemoryDirectory::new(MtsId::new("mts", PROCESS)));
     let location = vec![at(PROCESS, "shm://arms")];
     own.register(Registration::new("arm", ARM, location))
         .unwrap();

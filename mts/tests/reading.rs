@@ -78,7 +78,7 @@ impl Gateway {
             gate: Some(gate),
         };
         let own = Incarnation::from_u64(1);
-        let directory = MemoryDirectory::new(fipa_sds::Mts::new("mts", own));
+        let directory = MemoryDirectory::new(fipa_sds::MtsId::new("mts", own));
         for (name, agent) in agents {
             let at = "tcp://127.0.0.1:9#0000000000000001".parse().unwrap();
             let agent = Registration::new(*name, *agent, vec![at]);

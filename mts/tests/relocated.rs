@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
-use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Reach, Registration, Source, View};
+use fipa_sds::{Directory, Entry, MemoryDirectory, MtsId, Reach, Registration, Source, View};
 use fipa_transport::{
     Answer, AttemptId, Conclusion, Hop, Incarnation, Introduction, Kind, Location, Mandate,
     Outcome, Principal, TransportError,
@@ -27,7 +27,7 @@ fn tcp(host: u8) -> Location {
 
 /// A directory with the agent `arm` behind the gateway of another host.
 fn directory(locations: Vec<Location>) -> MemoryDirectory {
-    let directory = MemoryDirectory::new(Mts::new("peer", PEER));
+    let directory = MemoryDirectory::new(MtsId::new("peer", PEER));
     let arm = Registration::new("arm", ARM, locations);
     directory.register(arm).unwrap();
     directory

@@ -127,7 +127,7 @@ fn sent(letters: impl IntoIterator<Item = Letter>) -> (Arc<Shared>, Vec<Parcel>)
         .build()
         .unwrap();
     let own = Incarnation::from_u64(1);
-    let directory = MemoryDirectory::new(fipa_sds::Mts::new("mts", own));
+    let directory = MemoryDirectory::new(fipa_sds::MtsId::new("mts", own));
     let at = "shm://0000000000000009#0000000000000009".parse().unwrap();
     let arm = Registration::new("arm", Incarnation::from_u64(3), vec![at]);
     directory.register(arm).unwrap();

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Registration, Subscriber};
+use fipa_sds::{Directory, Entry, MemoryDirectory, MtsId, Registration, Subscriber};
 use fipa_transport::{Answer, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome};
 use parking_lot::Mutex;
 
@@ -67,7 +67,7 @@ struct Sender {
 impl Sender {
     /// `is_shown_by_refresh` is whether a refresh shows the second registration.
     fn new(is_shown_by_refresh: bool, config: CoreConfig) -> Self {
-        let shown = MemoryDirectory::new(Mts::new("mts", OWN));
+        let shown = MemoryDirectory::new(MtsId::new("mts", OWN));
         shown.register(arm(FIRST)).unwrap();
         let directory = Arc::new(Behind {
             shown,

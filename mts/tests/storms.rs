@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, Entry, MemoryDirectory, Mts, Reach, Registration, View};
+use fipa_sds::{Directory, Entry, MemoryDirectory, MtsId, Reach, Registration, View};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
     Kind, Location, Mandate, Parcel, Principal, Report, Stream, TransportError, TransportErrorKind,
@@ -205,7 +205,7 @@ fn letter(len: usize) -> Letter {
 
 impl Service {
     fn new(forwards: bool, liar: Liar) -> Self {
-        let directory = Arc::new(MemoryDirectory::new(Mts::new("liar", LIAR)));
+        let directory = Arc::new(MemoryDirectory::new(MtsId::new("liar", LIAR)));
         let config = CoreConfig {
             forwards,
             ..CoreConfig::new("mts", OWN, vec![Kind::Tcp])

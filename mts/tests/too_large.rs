@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Envelope, EnvelopeTemplate, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::{LetterDraft, letter_by, letter_for};
-use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
+use fipa_sds::{Directory as _, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
     Outcome, Parcel, Principal, Reaction, Stream, Ticket, TransportError, TransportErrorKind,
@@ -27,7 +27,7 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let mts = Mts::new("mts", Incarnation::from_u64(1));
+        let mts = MtsId::new("mts", Incarnation::from_u64(1));
         let directory = Arc::new(MemoryDirectory::new(mts));
         let order = vec![Kind::Shm, Kind::Udp, Kind::Tcp];
         let config = CoreConfig::new("mts", Incarnation::from_u64(1), order);
@@ -267,7 +267,7 @@ fn a_letter_has_at_most_1_mib_besides_its_content() {
 /// `arm` in its own process or in another one. `None` if it answers later.
 fn answer(forwards: bool, is_own: bool, len: usize) -> Option<Answer> {
     let own = Incarnation::from_u64(1);
-    let directory = MemoryDirectory::new(Mts::new("mts", own));
+    let directory = MemoryDirectory::new(MtsId::new("mts", own));
     let at = "shm://0000000000000009#0000000000000009".parse().unwrap();
     let arm = Registration::new("arm", ARM, vec![at]);
     directory.register(arm).unwrap();

@@ -77,7 +77,7 @@ fn all_tasks_that_are_about_to_wait_are_told_that_the_agent_is_gone() {
         tap: None,
         gate: None,
     };
-    let directory = MemoryDirectory::new(fipa_sds::Mts::new("mts", own));
+    let directory = MemoryDirectory::new(fipa_sds::MtsId::new("mts", own));
     let core = CoreConfig::new("mts", own, vec![Kind::Shm]);
     let transports: Vec<Arc<dyn Transport>> = vec![slow.clone()];
     let started = Mts::start(

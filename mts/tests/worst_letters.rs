@@ -18,7 +18,7 @@ use fipa_acl::{
 use fipa_mts::core::work;
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Undecodable, Unframed};
 use fipa_mts::{AccessGate, LetterParts, Link, letter_for};
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource, Location,
     Outcome, Parcel, Principal, Reaction, Report, Signature, Stream, Ticket, TransportError,
@@ -45,7 +45,7 @@ fn core() -> (Core, Arc<dyn Directory>) {
 }
 
 fn core_with(agents: u64) -> (Core, Arc<dyn Directory>) {
-    let directory = MemoryDirectory::new(Mts::new("mts", PROCESS));
+    let directory = MemoryDirectory::new(MtsId::new("mts", PROCESS));
     for number in 0..agents {
         let at = Location::new(Kind::Shm, "process").unwrap();
         let at = vec![at.with_incarnation(PROCESS)];

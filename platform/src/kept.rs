@@ -7,9 +7,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{
-    AgentId, Message, MessageBuilder, Payload, Representation, Dialect as AclDialect,
-};
+use fipa_acl::{AgentId, Dialect as AclDialect, Message, MessageBuilder, Payload, Representation};
 use fipa_content::{Content, SlDialect, Term, Wff};
 use serde::{Deserialize, Serialize};
 

@@ -15,21 +15,21 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant, UNIX_EPOCH};
 
-use fipa_sds::{Directory, Entry, Exchange, Mts, Present, Reach, Role, Source};
+use fipa_sds::{Directory, Entry, Exchange, MtsId, Present, Reach, Role, Source};
 use fipa_transport::{Incarnation, Location, Mandate, Principal};
 
 const LATENCY: Duration = Duration::from_millis(1);
 
 /// A gateway with its agents.
 struct Gateway {
-    mts: Mts,
+    mts: MtsId,
     exchange: Exchange,
     agents: Vec<Arc<Entry>>,
 }
 
 impl Gateway {
     fn new(host: u64, agents: u64) -> Self {
-        let mts = Mts::new(format!("gateway_{host}"), Incarnation::from_u64(host));
+        let mts = MtsId::new(format!("gateway_{host}"), Incarnation::from_u64(host));
         let agents = (0..agents).map(|agent| entry(&mts, host, agent)).collect();
         Self {
             exchange: Exchange::new(host),
@@ -54,7 +54,7 @@ impl Gateway {
     }
 }
 
-fn entry(mts: &Mts, host: u64, agent: u64) -> Arc<Entry> {
+fn entry(mts: &MtsId, host: u64, agent: u64) -> Arc<Entry> {
     Arc::new(Entry {
         name: format!("arm_{host}_{agent}").into(),
         agent_type: "arm".to_owned(),

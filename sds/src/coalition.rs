@@ -193,10 +193,10 @@ mod tests {
     use fipa_transport::Incarnation;
 
     use super::*;
-    use crate::{Directory, MemoryDirectory, Mts, Registration, Resolution, resolve};
+    use crate::{Directory, MemoryDirectory, MtsId, Registration, Resolution, resolve};
 
     fn directory(agents: &[&str]) -> MemoryDirectory {
-        let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));
+        let directory = MemoryDirectory::new(MtsId::new("mts", Incarnation::random()));
         for name in agents {
             let agent = Registration::new(*name, Incarnation::random(), Vec::new());
             directory.register(agent).unwrap();

@@ -14,7 +14,7 @@ use parking_lot::Mutex;
 
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::table::Table;
-use crate::{Directory, Entry, EntryError, Mts, Reach, Role, Source, Subscriber};
+use crate::{Directory, Entry, EntryError, MtsId, Reach, Role, Source, Subscriber};
 
 /// The error of [`ContactDirectory::heard`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -236,7 +236,7 @@ impl ContactDirectory {
             name: name.into(),
             agent_type: String::new(),
             incarnation,
-            mts: Mts::unnamed(gateway),
+            mts: MtsId::unnamed(gateway),
             locations,
             description: String::new(),
             registered: time_of_millis(millis_of_time(SystemTime::now())),
@@ -566,7 +566,7 @@ mod tests {
         let start = Instant::now();
         let gateway = location().incarnation();
         let mut exchange = Exchange::new(0);
-        let mts = Mts::new("arm-mts", gateway);
+        let mts = MtsId::new("arm-mts", gateway);
         exchange.handle_neighbors(start, &[Present::unproved(mts, vec![location()])]);
         let known = exchange.directory();
         contacts

@@ -22,7 +22,7 @@ pub struct Entry {
     /// transport service that listens there.
     pub locations: Vec<Location>,
     /// The message transport service that delivers to the agent.
-    pub mts: Mts,
+    pub mts: MtsId,
     /// Free text of its owner; may be empty.
     pub description: String,
     /// Time of registration, by the clock of the host on which the agent was registered, in whole
@@ -141,7 +141,7 @@ fn check_text(field: &'static str, text: &str, max: usize) -> Result<(), EntryEr
 
 /// A message transport service: the process that accepts letters for an agent, or a gateway.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
-pub struct Mts {
+pub struct MtsId {
     /// Name that the service states; several services may have the same name. Absent for a service that
     /// is only known from its address, which is not a name.
     pub name: Option<Arc<str>>,
@@ -149,7 +149,7 @@ pub struct Mts {
     pub incarnation: Incarnation,
 }
 
-impl Mts {
+impl MtsId {
     /// Creates a service with this name and incarnation.
     #[must_use]
     pub fn new(name: impl Into<Arc<str>>, incarnation: Incarnation) -> Self {
@@ -264,7 +264,7 @@ impl Registration {
     }
 
     /// Converts this registration to an entry of a local service.
-    pub(crate) fn into_entry(self, mts: &Mts, source: Source) -> Result<Entry, EntryError> {
+    pub(crate) fn into_entry(self, mts: &MtsId, source: Source) -> Result<Entry, EntryError> {
         if !self.incarnation.is_known() {
             return Err(EntryError::NoIncarnation);
         }

@@ -49,7 +49,7 @@ mod watch;
 pub use coalition::{Members, MembersError};
 pub use contacts::{ContactDirectory, ContactError, Heard};
 pub use directory::{DeregisterError, Directory, RegisterError, Updated};
-pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
+pub use entry::{Entry, EntryError, MtsId, Reach, Registration, Role, Source};
 pub use exchange::{
     DfEntry, EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError, LetterKind, OwnDfEntry,
     Present,

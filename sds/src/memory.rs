@@ -8,21 +8,21 @@ use fipa_transport::{Incarnation, Location, PeerId, Principal, Signature};
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::table::Table;
 use crate::{
-    DeregisterError, Directory, Entry, EntryError, Mts, Reach, RegisterError, Registration, Role,
+    DeregisterError, Directory, Entry, EntryError, MtsId, Reach, RegisterError, Registration, Role,
     Source, Subscriber,
 };
 
 /// A directory of the agents of one process.
 #[derive(Debug)]
 pub struct MemoryDirectory {
-    mts: Mts,
+    mts: MtsId,
     table: Table<()>,
 }
 
 impl MemoryDirectory {
     /// Creates an empty directory; this message transport service serves all its registrations.
     #[must_use]
-    pub fn new(mts: Mts) -> Self {
+    pub fn new(mts: MtsId) -> Self {
         Self {
             mts,
             table: Table::new(),
@@ -84,7 +84,7 @@ impl StaticDirectory {
                 agent_type: String::new(),
                 incarnation: Incarnation::UNKNOWN,
                 locations,
-                mts: Mts::new(name, Incarnation::UNKNOWN),
+                mts: MtsId::new(name, Incarnation::UNKNOWN),
                 description: String::new(),
                 registered,
                 source: Source::Static,

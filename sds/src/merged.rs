@@ -405,7 +405,7 @@ impl MergedView {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Members, MemoryDirectory, Mts, Query};
+    use crate::{Members, MemoryDirectory, MtsId, Query};
 
     /// A back end that speaks for every service.
     struct Speaker(MemoryDirectory);
@@ -448,7 +448,7 @@ mod tests {
     #[test]
     fn a_view_answers_repeated_lookups_as_its_directory_does() {
         let of = Incarnation::from_u64;
-        let mts = Mts::new("mts", of(1));
+        let mts = MtsId::new("mts", of(1));
         let [first, second] = [(); 2].map(|()| Arc::new(MemoryDirectory::new(mts.clone())));
         let inner = MergedDirectory::new(vec![first.clone()]);
         let merged = MergedDirectory::new(vec![Arc::new(inner), second.clone()]);
@@ -486,7 +486,7 @@ mod tests {
 
     #[test]
     fn coalitions_come_from_the_back_end_that_speaks_for_their_service() {
-        let mts = Mts::new("mts", Incarnation::from_u64(1));
+        let mts = MtsId::new("mts", Incarnation::from_u64(1));
         let first = Arc::new(MemoryDirectory::new(mts.clone()));
         let speaker = Arc::new(Speaker(MemoryDirectory::new(mts)));
         let merged = MergedDirectory::new(vec![first.clone(), speaker.clone()]);
@@ -511,7 +511,7 @@ mod tests {
         first.deregister("team", id).unwrap();
         assert_eq!(watch.try_next(), None);
         // After a restart of an agent's service, the entry of the new service is visible.
-        let restarted = Arc::new(Speaker(MemoryDirectory::new(Mts::new(
+        let restarted = Arc::new(Speaker(MemoryDirectory::new(MtsId::new(
             "mts",
             Incarnation::from_u64(2),
         ))));

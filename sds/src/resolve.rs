@@ -110,10 +110,10 @@ mod tests {
     use fipa_transport::Incarnation;
 
     use super::*;
-    use crate::{Directory, MemoryDirectory, Mts, Registration};
+    use crate::{Directory, MemoryDirectory, MtsId, Registration};
 
     fn directory(names: &[&str]) -> MemoryDirectory {
-        let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));
+        let directory = MemoryDirectory::new(MtsId::new("mts", Incarnation::random()));
         for name in names {
             let agent = Registration::new(*name, Incarnation::random(), Vec::new());
             directory.register(agent).unwrap();

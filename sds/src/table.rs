@@ -483,14 +483,14 @@ fn is_same_registration(a: &Entry, b: &Entry) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Mts, Registration, Source};
+    use crate::{MtsId, Registration, Source};
 
     fn entry(incarnation: u64, gateway: u64, address: &str) -> Arc<Entry> {
         let at = format!("tcp://{address}:7788#00000000000000aa");
         let incarnation = Incarnation::from_u64(incarnation);
         let mut arm = Registration::new("arm", incarnation, vec![at.parse().unwrap()]);
         arm.registered = std::time::UNIX_EPOCH;
-        let gateway = Mts::new("theirs", Incarnation::from_u64(gateway));
+        let gateway = MtsId::new("theirs", Incarnation::from_u64(gateway));
         Arc::new(arm.into_entry(&gateway, Source::Mdns).unwrap())
     }
 

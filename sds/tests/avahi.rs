@@ -10,7 +10,7 @@
 mod common;
 
 use common::registration;
-use fipa_sds::{Change, Directory, Entry, MdnsConfig, MdnsDirectory, Mts, Role, Source};
+use fipa_sds::{Change, Directory, Entry, MdnsConfig, MdnsDirectory, MtsId, Role, Source};
 use fipa_testbed::{Avahi, Network, until_some_async};
 use fipa_transport::{Incarnation, Location};
 
@@ -47,7 +47,7 @@ fn inside_avahi_and_we_read_each_other() {
 fn open(name: &str) -> MdnsDirectory {
     let config = MdnsConfig {
         interfaces: vec!["eth0".to_owned()],
-        ..MdnsConfig::new(Mts::new(name, Incarnation::random()))
+        ..MdnsConfig::new(MtsId::new(name, Incarnation::random()))
     };
     MdnsDirectory::open(config).unwrap()
 }
@@ -58,7 +58,7 @@ async fn all_interfaces_include_loopback() {
         let config = MdnsConfig {
             interfaces: interfaces.iter().map(ToString::to_string).collect(),
             port: 5454,
-            ..MdnsConfig::new(Mts::new("mts", Incarnation::random()))
+            ..MdnsConfig::new(MtsId::new("mts", Incarnation::random()))
         };
         MdnsDirectory::open(config).unwrap()
     };

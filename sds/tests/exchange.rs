@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use fipa_sds::{
     Change, ContactDirectory, Directory, Entry, Exchange, ExchangeError, LetterKind,
-    MergedDirectory, Mts, OwnDfEntry, Present, Reach, Role, Source,
+    MergedDirectory, MtsId, OwnDfEntry, Present, Reach, Role, Source,
 };
 use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal};
 
@@ -18,7 +18,7 @@ use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal};
 const DEADLINE: Duration = Duration::from_secs(5);
 
 struct Gateway {
-    mts: Mts,
+    mts: MtsId,
     exchange: Exchange,
     agents: BTreeMap<String, Arc<Entry>>,
     /// The entries in its directory facilitator.
@@ -59,7 +59,7 @@ fn location(index: usize) -> Location {
 impl World {
     fn new(count: usize, seed: u64) -> Self {
         let gateways = (0..count).map(|index| Gateway {
-            mts: Mts::new("same-name-mts", Incarnation::from_u64(index as u64 + 1)),
+            mts: MtsId::new("same-name-mts", Incarnation::from_u64(index as u64 + 1)),
             exchange: Exchange::new(seed ^ index as u64),
             agents: BTreeMap::new(),
             df: BTreeMap::new(),
@@ -692,7 +692,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let new = Incarnation::from_u64(77);
     let at = location(0).with_incarnation(new);
     let known = Present::unproved(world.gateways[0].mts.clone(), vec![location(0)]);
-    let restarted = Present::unproved(Mts::new("same-name-mts", new), vec![at]);
+    let restarted = Present::unproved(MtsId::new("same-name-mts", new), vec![at]);
     let told = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,"agents":
         [{"name":"arm","type":"arm","id":"00000000000003e9","registered":1001}]}}}"#;
     let now = world.now;
@@ -710,7 +710,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     // own.
     let newer = Incarnation::from_u64(78);
     let at = location(0).with_incarnation(newer);
-    let started_again = Present::unproved(Mts::new("same-name-mts", newer), vec![at]);
+    let started_again = Present::unproved(MtsId::new("same-name-mts", newer), vec![at]);
     exchange.handle_neighbors(now, &[]);
     exchange.handle_neighbors(now, std::slice::from_ref(&started_again));
     assert_eq!(gateway(), Some(new));
@@ -723,7 +723,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let at = location(0).with_incarnation(newest);
     let both = [
         started_again,
-        Present::unproved(Mts::new("same-name-mts", newest), vec![at]),
+        Present::unproved(MtsId::new("same-name-mts", newest), vec![at]),
     ];
     exchange.handle_neighbors(now, &both);
     let silent = location(0).with_incarnation(newer);
@@ -1080,7 +1080,7 @@ fn told(exchange: &mut Exchange, content: &str) -> Result<(), ExchangeError> {
 
 fn with_neighbor() -> Exchange {
     let mut exchange = Exchange::new(0);
-    let mts = Mts::new("hostile", Incarnation::from_u64(7));
+    let mts = MtsId::new("hostile", Incarnation::from_u64(7));
     exchange.handle_neighbors(Instant::now(), &[Present::unproved(mts, vec![location(6)])]);
     exchange
 }
@@ -1186,7 +1186,7 @@ fn the_number_of_agents_of_a_neighbor_is_bounded() {
     let crowd: Vec<_> = (0..2000)
         .map(|number| {
             Present::unproved(
-                Mts::new("x", Incarnation::from_u64(number + 1)),
+                MtsId::new("x", Incarnation::from_u64(number + 1)),
                 vec![location(0)],
             )
         })
@@ -1230,7 +1230,7 @@ fn present(hosts: impl IntoIterator<Item = usize>) -> Vec<Present> {
             .parse::<Location>()
             .unwrap()
             .with_incarnation(incarnation);
-        Present::unproved(Mts::new("x", incarnation), vec![at])
+        Present::unproved(MtsId::new("x", incarnation), vec![at])
     });
     present.collect()
 }
@@ -1507,7 +1507,7 @@ fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
 
 #[test]
 fn df_entries_that_are_too_long_or_of_others_are_ignored() {
-    let mts = Mts::new("hostile", Incarnation::from_u64(7));
+    let mts = MtsId::new("hostile", Incarnation::from_u64(7));
     let mut exchange = Exchange::new(0);
     let certified = Present {
         mandate: Mandate::Certified((1..5).map(|number| format!("own_{number}")).collect()),

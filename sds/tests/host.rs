@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use common::{conforms, next, registration};
 use fipa_sds::{
-    Cancellation, Change, Directory, Entry, HostConfig, HostDirectory, HostError, Mts, Reach,
+    Cancellation, Change, Directory, Entry, HostConfig, HostDirectory, HostError, MtsId, Reach,
     RegisterError, Role, Source,
 };
 use fipa_testbed::{ChildGuard, until_some_async};
@@ -25,7 +25,7 @@ fn config(dir: &Path) -> HostConfig {
     HostConfig {
         brief: false,
         dir: dir.to_owned(),
-        mts: Mts::new("mts", Incarnation::random()),
+        mts: MtsId::new("mts", Incarnation::random()),
         gateway: false,
     }
 }
@@ -588,7 +588,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         agent_type: "sensor".to_owned(),
         incarnation: Incarnation::random(),
         locations: vec!["shm://gateway".parse().unwrap()],
-        mts: Mts::new("far-mts", Incarnation::random()),
+        mts: MtsId::new("far-mts", Incarnation::random()),
         description: String::new(),
         registered: std::time::UNIX_EPOCH,
         source: Source::Mdns,
@@ -860,7 +860,7 @@ async fn a_contact_keeps_no_agent_from_its_name() {
         agent_type: String::new(),
         incarnation: Incarnation::random(),
         locations: vec!["shm://gateway".parse().unwrap()],
-        mts: Mts::unnamed(Incarnation::random()),
+        mts: MtsId::unnamed(Incarnation::random()),
         description: String::new(),
         registered: std::time::UNIX_EPOCH,
         source: Source::Contact,
@@ -916,7 +916,7 @@ fn remote(gateway: u64, number: u64, description: &str) -> Arc<Entry> {
         agent_type: String::new(),
         incarnation: Incarnation::from_u64(gateway * 100_000 + number),
         locations: vec!["shm://0123456789abcdef#0123456789abcdef".parse().unwrap()],
-        mts: Mts::new("theirs", Incarnation::from_u64(gateway)),
+        mts: MtsId::new("theirs", Incarnation::from_u64(gateway)),
         description: description.to_owned(),
         registered: std::time::UNIX_EPOCH,
         source: Source::Exchange,

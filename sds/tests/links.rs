@@ -13,7 +13,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use common::registration;
-use fipa_sds::{Directory, MdnsConfig, MdnsDirectory, Mts};
+use fipa_sds::{Directory, MdnsConfig, MdnsDirectory, MtsId};
 use fipa_testbed::{Family, Host, Network, until};
 use fipa_transport::Incarnation;
 use tokio::runtime::Runtime;
@@ -151,7 +151,7 @@ impl Member {
                 .unwrap();
             let config = MdnsConfig {
                 interfaces: vec!["eth0".to_owned()],
-                ..MdnsConfig::new(Mts::new(host.name(), Incarnation::random()))
+                ..MdnsConfig::new(MtsId::new(host.name(), Incarnation::random()))
             };
             let directory = {
                 let _context = runtime.enter();

@@ -10,13 +10,13 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use common::{conforms, next, registration};
 use fipa_sds::{
-    Change, Directory, MemoryDirectory, MergedDirectory, Mts, RegisterError, Role, StaticDirectory,
-    Watch,
+    Change, Directory, MemoryDirectory, MergedDirectory, MtsId, RegisterError, Role,
+    StaticDirectory, Watch,
 };
 use fipa_transport::Incarnation;
 
 fn memory() -> MemoryDirectory {
-    MemoryDirectory::new(Mts::new("mts", Incarnation::random()))
+    MemoryDirectory::new(MtsId::new("mts", Incarnation::random()))
 }
 
 #[tokio::test]

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use fipa_sds::{
     ContactDirectory, ContactError, Directory, EntryError, HostConfig, HostDirectory,
-    MemoryDirectory, Mts, NameError, RegisterError, Registration, StaticDirectory,
+    MemoryDirectory, MtsId, NameError, RegisterError, Registration, StaticDirectory,
 };
 use fipa_transport::{Incarnation, Location};
 
@@ -50,12 +50,12 @@ fn refuses(directory: &dyn Directory) {
 
 #[tokio::test]
 async fn they_are_refused_at_registration() {
-    refuses(&MemoryDirectory::new(Mts::new("mts", MTS)));
+    refuses(&MemoryDirectory::new(MtsId::new("mts", MTS)));
     let home = tempfile::tempdir().unwrap();
     let config = HostConfig {
         brief: false,
         dir: home.path().join("domain"),
-        mts: Mts::new("mts", MTS),
+        mts: MtsId::new("mts", MTS),
         gateway: false,
     };
     refuses(&HostDirectory::open(config).unwrap());

@@ -8,8 +8,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_sds::{
-    Change, ContactDirectory, Directory, Entry, Exchange, ExchangeDirectory, MergedDirectory, Mts,
-    Present, StaticDirectory, Subscriber,
+    Change, ContactDirectory, Directory, Entry, Exchange, ExchangeDirectory, MergedDirectory,
+    MtsId, Present, StaticDirectory, Subscriber,
 };
 use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal};
 
@@ -36,7 +36,7 @@ fn certificate(gateway: u64) -> Principal {
 
 fn present(gateway: u64, mandate: Mandate) -> Present {
     Present {
-        mts: Mts::new(format!("mts-{gateway}"), Incarnation::from_u64(gateway)),
+        mts: MtsId::new(format!("mts-{gateway}"), Incarnation::from_u64(gateway)),
         locations: vec![location(gateway)],
         mandate,
         principal: certificate(gateway),
@@ -261,7 +261,7 @@ fn many_conflicts_of_one_peer_do_not_hide_those_of_others() {
 fn a_gateway_that_restarts_at_another_address_takes_its_agents_back() {
     // Gateway 2 is gateway 1 after a restart; gateway 3 has another name.
     let restarted = |gateway: u64, name: &str| Present {
-        mts: Mts::new(name, Incarnation::from_u64(gateway)),
+        mts: MtsId::new(name, Incarnation::from_u64(gateway)),
         principal: certificate(1),
         ..present(gateway, certified(&[]))
     };
@@ -391,7 +391,7 @@ fn a_registration_that_another_neighbor_claims_stays_with_its_agent() {
 #[test]
 fn a_gateway_that_lists_the_address_of_another_does_not_replace_it() {
     let liar = Present {
-        mts: Mts::new("mts-1", Incarnation::from_u64(2)),
+        mts: MtsId::new("mts-1", Incarnation::from_u64(2)),
         locations: vec![location(2), location(1)],
         ..present(2, certified(&[]))
     };

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::{
     Change, ContactDirectory, DeregisterError, Directory, Exchange, ExchangeDirectory, Matcher,
-    MemoryDirectory, MergedDirectory, Mts, Present, Query, Reach, RegisterError, Registration,
+    MemoryDirectory, MergedDirectory, MtsId, Present, Query, Reach, RegisterError, Registration,
     Resolution, Source, StaticDirectory, resolve,
 };
 use fipa_transport::{Incarnation, Location};
@@ -150,7 +150,7 @@ fn exchange() -> (Instant, Exchange, Arc<ExchangeDirectory>) {
     let gateways: Vec<_> = (1..=3)
         .map(|number| {
             Present::unproved(
-                Mts::new("mts", Incarnation::from_u64(number)),
+                MtsId::new("mts", Incarnation::from_u64(number)),
                 vec![location(number)],
             )
         })
@@ -214,7 +214,10 @@ fn merged_views_of_them_conform() {
         heard.forget(now, &named());
     });
     // A writable directory makes the view writable.
-    let memory = Arc::new(MemoryDirectory::new(Mts::new("own", Incarnation::random())));
+    let memory = Arc::new(MemoryDirectory::new(MtsId::new(
+        "own",
+        Incarnation::random(),
+    )));
     let view = MergedDirectory::new(vec![heard, memory.clone()]);
     let own = Registration::new("own", Incarnation::random(), Vec::new());
     view.register(own.clone()).unwrap();

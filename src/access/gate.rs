@@ -214,8 +214,8 @@ mod tests {
     use fipa_acl::{
         AclRepresentation, AgentId, Envelope, EnvelopeParams, Message, Performative, Received, Time,
     };
-    use fipa_mts::Source;
-    use fipa_sds::{HostConfig, Mts, Registration};
+    use fipa_mts::LetterSource;
+    use fipa_sds::{HostConfig, MtsId, Registration};
     use fipa_transport::{Incarnation, Kind};
 
     use super::*;
@@ -253,7 +253,7 @@ mod tests {
             let directory = HostDirectory::open(HostConfig {
                 brief: false,
                 dir: place.path().join("domain"),
-                mts: Mts::new("mts", Incarnation::random()),
+                mts: MtsId::new("mts", Incarnation::random()),
                 gateway,
             });
             directory.unwrap()
@@ -275,10 +275,10 @@ mod tests {
     const GATEWAY: Incarnation = Incarnation::from_u64(0x6a7e);
 
     /// Returns the source of the letters of a service on this host.
-    fn source_by(via: Kind, service: Incarnation) -> Source {
+    fn source_by(via: Kind, service: Incarnation) -> LetterSource {
         match via.is_host_local() {
-            true => Source::Process(service),
-            false => Source::at(std::net::Ipv4Addr::LOCALHOST.into()),
+            true => LetterSource::Process(service),
+            false => LetterSource::at(std::net::Ipv4Addr::LOCALHOST.into()),
         }
     }
 

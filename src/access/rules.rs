@@ -11,7 +11,7 @@ use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_mts::Source;
+use fipa_mts::LetterSource;
 use fipa_sds::Matcher;
 use fipa_transport::TokenBucket;
 
@@ -64,9 +64,9 @@ pub(crate) struct Access {
 /// The senders of all sources, at most [`MAX_SENDERS`].
 #[derive(Debug, Default)]
 struct Senders {
-    sources: HashMap<Source, SourceSenders>,
+    sources: HashMap<LetterSource, SourceSenders>,
     /// Each source with its number of senders, ordered by that number.
-    sizes: BTreeSet<(usize, Source)>,
+    sizes: BTreeSet<(usize, LetterSource)>,
     /// Number of senders of all sources.
     len: usize,
     /// Time of the last removal of silent senders.
@@ -142,7 +142,7 @@ impl Access {
     /// Counts a letter that the rules allow. Fails when the sender exceeds its rate by this source.
     pub(crate) fn count(
         &mut self,
-        source: Source,
+        source: LetterSource,
         sender: &str,
         now: Instant,
     ) -> Result<(), Refusal> {
@@ -160,12 +160,18 @@ impl Access {
 
 impl Senders {
     /// Returns the rate of this sender by this source, if it is stored.
-    fn get_mut(&mut self, source: Source, sender: &str) -> Option<&mut Sender> {
+    fn get_mut(&mut self, source: LetterSource, sender: &str) -> Option<&mut Sender> {
         self.sources.get_mut(&source)?.senders.get_mut(sender)
     }
 
     /// Stores a new sender of this source, and makes room for it if necessary.
-    fn insert(&mut self, source: Source, sender: &str, rate: f64, now: Instant) -> &mut Sender {
+    fn insert(
+        &mut self,
+        source: LetterSource,
+        sender: &str,
+        rate: f64,
+        now: Instant,
+    ) -> &mut Sender {
         if self.len >= MAX_SENDERS {
             self.make_room(now);
         }
@@ -438,8 +444,8 @@ mod tests {
         }
     }
 
-    const ROVER: Source = Source::Certificate([1; 32]);
-    const CREX: Source = Source::Certificate([2; 32]);
+    const ROVER: LetterSource = LetterSource::Certificate([1; 32]);
+    const CREX: LetterSource = LetterSource::Certificate([2; 32]);
     const TOO_MANY: Result<(), Refusal> = Err(Refusal::TooMany);
 
     #[test]
@@ -459,7 +465,7 @@ mod tests {
         assert_eq!(access.count(ROVER, "arm", now), Ok(()));
         // Many sources with one sender each evict the senders of a source with two or more.
         for number in 0..MAX_SENDERS as u64 {
-            let source = Source::Process(fipa_transport::Incarnation::from_u64(number + 1));
+            let source = LetterSource::Process(fipa_transport::Incarnation::from_u64(number + 1));
             assert_eq!(access.count(source, "agent", now), Ok(()));
         }
         let of = |source| access.senders.sources.get(&source).map(|it| it.order.len());

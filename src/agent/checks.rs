@@ -438,7 +438,7 @@ mod tests {
 
     use fipa_acl::{AgentId, Time};
     use fipa_mts::letter_for;
-    use fipa_sds::{MemoryDirectory, Mts, Registration};
+    use fipa_sds::{MemoryDirectory, MtsId, Registration};
     use fipa_transport::{Kind, PeerId};
 
     use super::*;
@@ -481,7 +481,7 @@ mod tests {
     }
 
     fn directory() -> MemoryDirectory {
-        MemoryDirectory::new(Mts::new("here", PROCESS))
+        MemoryDirectory::new(MtsId::new("here", PROCESS))
     }
 
     /// Returns the kind of violation that an enforcing agent finds in a message from this sender.

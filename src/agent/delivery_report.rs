@@ -43,7 +43,7 @@ mod tests {
     use fipa_acl::{AgentId, Message};
     use fipa_mts::core::Received;
     use fipa_mts::letter_for;
-    use fipa_sds::{MemoryDirectory, Mts, Registration};
+    use fipa_sds::{MemoryDirectory, MtsId, Registration};
     use fipa_transport::{Incarnation, Kind};
 
     use super::*;
@@ -54,7 +54,7 @@ mod tests {
     const MALLORY: Incarnation = Incarnation::from_u64(4);
 
     fn directory() -> Arc<MemoryDirectory> {
-        let directory = MemoryDirectory::new(Mts::new("here", MTS));
+        let directory = MemoryDirectory::new(MtsId::new("here", MTS));
         let agents = [("arm", ARM), ("mallory", MALLORY)];
         for (name, incarnation) in agents {
             let agent = Registration::new(name, incarnation, Vec::new());

@@ -574,7 +574,7 @@ mod tests {
     use fipa_acl::{AgentId, Performative};
     use fipa_mts::core::Received;
     use fipa_mts::letter_for;
-    use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+    use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
     use fipa_transport::Kind;
 
     use super::*;
@@ -624,7 +624,7 @@ mod tests {
     }
 
     fn entry(name: &str, incarnation: Incarnation) -> Arc<Entry> {
-        let directory = MemoryDirectory::new(Mts::new("mts", ARMS_MTS));
+        let directory = MemoryDirectory::new(MtsId::new("mts", ARMS_MTS));
         let agent = Registration::new(name, incarnation, Vec::new());
         directory.register(agent).unwrap()
     }

@@ -14,7 +14,7 @@ use fipa_transport::{Kind, Location};
 use super::keys::dotted;
 use super::keys::{is_interface_name, is_numeric_address};
 use super::{
-    Access, Config, Interface, Mistake, Origin, Peer, Platform, PlatformAgent, Route, Shm,
+    Access, Config, Interface, Mistake, Origin, PeerConfig, Platform, PlatformAgent, RouteConfig, Shm,
 };
 
 /// Maximum length of the name of a domain, in bytes.
@@ -432,7 +432,7 @@ impl Findings {
             self.too_many(&["routes"], config.routes.len(), MAX_ROUTES);
             return;
         }
-        for Route {
+        for RouteConfig {
             receiver,
             transports,
         } in &config.routes
@@ -539,12 +539,12 @@ impl Findings {
         }
     }
 
-    fn peers(&mut self, peers: &[Peer]) {
+    fn peers(&mut self, peers: &[PeerConfig]) {
         if peers.len() > MAX_PEERS {
             self.too_many(&["discovery", "static"], peers.len(), MAX_PEERS);
             return;
         }
-        for Peer { name, locations } in peers {
+        for PeerConfig { name, locations } in peers {
             let path = ["discovery", "static", name.as_str()];
             self.name(&path, name);
             if locations.is_empty() {

@@ -14,7 +14,7 @@ use fipa_transport::{Kind, LocationError};
 use serde::Serialize;
 use toml_edit::Value as Toml;
 
-use super::{AccessRule, Check, Config, Interface, Peer, PlatformAgent, Route};
+use super::{AccessRule, Check, Config, Interface, PeerConfig, PlatformAgent, RouteConfig};
 
 /// A value as it is written in the file. Sizes, durations and addresses are text.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -390,7 +390,7 @@ pub(super) const MAPS: &[Map] = &[
         write: |config, receiver, value| {
             let transports = kinds(value)?;
             let receiver = receiver.to_owned();
-            config.routes.push(Route {
+            config.routes.push(RouteConfig {
                 receiver,
                 transports,
             });
@@ -409,7 +409,7 @@ pub(super) const MAPS: &[Map] = &[
         write: |config, name, value| {
             let locations = items(value, parsed)?;
             let name = name.to_owned();
-            config.discovery.peers.push(Peer { name, locations });
+            config.discovery.peers.push(PeerConfig { name, locations });
             Ok(())
         },
         read: |config| {

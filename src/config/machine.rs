@@ -8,7 +8,7 @@ use std::net::{IpAddr, UdpSocket};
 use fipa_transport::Location;
 
 use super::check::Finding;
-use super::{Config, Interface, Peer};
+use super::{Config, Interface, PeerConfig};
 
 /// Returns the values that name something that this machine does not have.
 pub(super) fn findings(config: &Config) -> Vec<Finding> {
@@ -22,7 +22,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
 
 fn static_peers(config: &Config, found: &mut Vec<Finding>) {
     let on = &config.mts.transports;
-    for Peer { name, locations } in &config.discovery.peers {
+    for PeerConfig { name, locations } in &config.discovery.peers {
         let kinds: Vec<_> = locations.iter().map(|location| location.kind()).collect();
         let Some(first) = kinds.first() else { continue };
         let has_no_scope =

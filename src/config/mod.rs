@@ -108,10 +108,10 @@ pub struct Config {
     /// the names of shared memory: 1 to 32 of `A-Z a-z 0-9 _ -`.
     pub domain: String,
     /// `[mts]`: the message transport service of this process.
-    pub mts: Mts,
+    pub mts: MtsConfig,
     /// `[routes]`: the orders of transports for particular receivers. The first match counts; entries
     /// of `--set` precede those of the file.
-    pub routes: Vec<Route>,
+    pub routes: Vec<RouteConfig>,
     /// `[transport.*]`: the settings of the transports.
     pub transport: Transports,
     /// `[discovery]`: the discovery of other hosts.
@@ -131,7 +131,7 @@ pub struct Config {
 /// `[mts]`: the message transport service of a process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct Mts {
+pub struct MtsConfig {
     /// `name`: the name of the gateway, 1 to 255 bytes without control characters.
     pub name: String,
     /// `transports`: the transports in order of preference, none twice; others are off.
@@ -153,7 +153,7 @@ pub struct Mts {
 /// One line of `[routes]`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct Route {
+pub struct RouteConfig {
     /// The name of a receiver, or a [`fipa_sds::Pattern`] that is matched against the whole name.
     pub receiver: String,
     /// The order of transports for these receivers. Transports that are not in [`Mts::transports`] are
@@ -244,14 +244,14 @@ pub struct Discovery {
     /// `interfaces`: the network interfaces for multicast DNS; empty: all.
     pub interfaces: Vec<Interface>,
     /// `static`: gateways, and agents of legacy peers, that are known without discovery.
-    pub peers: Vec<Peer>,
+    pub peers: Vec<PeerConfig>,
 }
 
 /// One line of `discovery.static`: a peer that is known without discovery. It is a gateway, or an
 /// agent of a legacy peer if its locations state the dialect of a legacy peer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct Peer {
+pub struct PeerConfig {
     /// The name of the gateway, or of the agent.
     pub name: String,
     /// The locations at which it listens, in order of preference; at least one.
@@ -462,7 +462,7 @@ impl Config {
         };
         Self {
             domain: "default".to_owned(),
-            mts: Mts {
+            mts: MtsConfig {
                 name: keys::default_mts_name(host_name),
                 transports: vec![Kind::Shm, Kind::Unix, Kind::Tcp],
                 deadline: Duration::from_secs(5),

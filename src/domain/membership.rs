@@ -54,7 +54,7 @@ pub(crate) struct Membership {
 /// Creates the directory of the domain and joins the agent directory of the host in it.
 pub(crate) fn join(
     domain: &str,
-    own: &fipa_sds::Mts,
+    own: &fipa_sds::MtsId,
     Membership { gateway, brief }: Membership,
     cancellation: &Cancellation,
 ) -> Result<(DomainDir, Arc<HostDirectory>), OpenError> {

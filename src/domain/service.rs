@@ -40,7 +40,7 @@ pub(crate) struct Service {
     locations: watch::Receiver<Arc<[Location]>>,
     pub(crate) name: Arc<str>,
     /// The service in the directory.
-    pub(crate) own: fipa_sds::Mts,
+    pub(crate) own: fipa_sds::MtsId,
     pub(crate) dir: DomainDir,
     /// The task that serves the watchers.
     watching: JoinHandle<()>,
@@ -94,7 +94,7 @@ fn best(locations: Vec<Location>) -> Vec<Location> {
 
 /// Creates a view from the directory of this host and the service that looks up receivers.
 pub(crate) type View<'a> =
-    dyn Fn(Arc<HostDirectory>, &fipa_sds::Mts) -> Result<Arc<dyn Directory>, OpenError> + 'a;
+    dyn Fn(Arc<HostDirectory>, &fipa_sds::MtsId) -> Result<Arc<dyn Directory>, OpenError> + 'a;
 
 impl Service {
     /// Starts the service. Waits for other processes, so it must be called on a thread for blocking
@@ -112,7 +112,7 @@ impl Service {
         config.check()?;
         let handle = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let incarnation = Incarnation::random();
-        let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
+        let own = fipa_sds::MtsId::new(Arc::clone(&role.name), incarnation);
         let membership = Membership {
             gateway: role.gateway,
             brief: role.brief,

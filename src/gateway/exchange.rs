@@ -637,7 +637,7 @@ mod tests {
             agent_type: String::new(),
             incarnation: Incarnation::from_u64(number),
             locations: Vec::new(),
-            mts: fipa_sds::Mts::new("mts", gateway),
+            mts: fipa_sds::MtsId::new("mts", gateway),
             description: String::new(),
             registered: SystemTime::UNIX_EPOCH,
             source: fipa_sds::Source::Exchange,

@@ -523,7 +523,7 @@ fn announces_on_loopback_only(config: &Config) -> bool {
 }
 
 /// Whether an entry of `discovery.static` names an agent of a legacy peer instead of a gateway.
-fn is_legacy(peer: &crate::config::Peer) -> bool {
+fn is_legacy(peer: &crate::config::PeerConfig) -> bool {
     let mut locations = peer.locations.iter();
     locations.all(|location| location.signature() != Signature::Frames)
 }
@@ -593,7 +593,7 @@ impl Network for fipa_sds::MdnsDirectory {
 }
 
 #[cfg(feature = "mdns")]
-fn network(config: &Config, mts: &fipa_sds::Mts) -> Result<Option<Arc<dyn Network>>, OpenError> {
+fn network(config: &Config, mts: &fipa_sds::MtsId) -> Result<Option<Arc<dyn Network>>, OpenError> {
     if !config.discovery.mdns {
         return Ok(None);
     }
@@ -612,7 +612,7 @@ fn network(config: &Config, mts: &fipa_sds::Mts) -> Result<Option<Arc<dyn Networ
 }
 
 #[cfg(not(feature = "mdns"))]
-fn network(_: &Config, _: &fipa_sds::Mts) -> Result<Option<Arc<dyn Network>>, OpenError> {
+fn network(_: &Config, _: &fipa_sds::MtsId) -> Result<Option<Arc<dyn Network>>, OpenError> {
     Ok(None)
 }
 

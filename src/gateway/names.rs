@@ -66,7 +66,7 @@ pub(super) fn contested(
 mod tests {
     use std::time::Instant;
 
-    use fipa_sds::{Exchange, HostConfig, MergedDirectory, Mts, Present, Registration};
+    use fipa_sds::{Exchange, HostConfig, MergedDirectory, MtsId, Present, Registration};
     use fipa_transport::{Incarnation, Mandate, Principal};
 
     use super::*;
@@ -78,7 +78,7 @@ mod tests {
         let host = HostDirectory::open(HostConfig {
             brief: false,
             dir: place.path().join("domain"),
-            mts: Mts::new("mts", Incarnation::from_u64(1)),
+            mts: MtsId::new("mts", Incarnation::from_u64(1)),
             gateway: true,
         });
         let host = host.unwrap();
@@ -88,7 +88,7 @@ mod tests {
         let gateway = Incarnation::from_u64(7);
         let mut exchange = Exchange::new(0);
         let present = Present {
-            mts: Mts::new("crex-mts", gateway),
+            mts: MtsId::new("crex-mts", gateway),
             locations: vec!["tcp://192.0.2.1:7788#0000000000000007".parse().unwrap()],
             mandate,
             principal: Principal::Certificate([7; 32]),

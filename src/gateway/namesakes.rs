@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::escape;
-use fipa_sds::{Directory, MergedDirectory, Mts, Reach};
+use fipa_sds::{Directory, MergedDirectory, MtsId, Reach};
 use fipa_transport::{Incarnation, Location, log_limit};
 
 use super::neighbors::{Neighbor, Neighbors};
@@ -30,7 +30,7 @@ const MAX_GATEWAYS: usize = 8;
 /// Finds the names that several gateways have.
 pub(super) struct Namesakes {
     /// The service of this gateway.
-    pub(super) own: Mts,
+    pub(super) own: MtsId,
     pub(super) neighbors: Arc<Neighbors>,
     /// The directories of other hosts.
     pub(super) known: Arc<MergedDirectory>,

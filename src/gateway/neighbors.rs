@@ -13,7 +13,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{ErrorChain, escape_name};
 use fipa_mts::core::Peer;
 use fipa_sds::{
-    DeregisterError, Directory, Entry, MergedDirectory, Mts, Reach, RegisterError, Registration,
+    DeregisterError, Directory, Entry, MergedDirectory, MtsId, Reach, RegisterError, Registration,
     Role, Source, Subscriber, View as DirectoryView, Watch,
 };
 use fipa_transport::{
@@ -297,7 +297,7 @@ impl State {
             name: Arc::clone(&peer.name),
             agent_type: "fipa-mts".to_owned(),
             incarnation,
-            mts: Mts::new(Arc::clone(&peer.name), incarnation),
+            mts: MtsId::new(Arc::clone(&peer.name), incarnation),
             locations: Vec::new(),
             description: String::new(),
             registered: SystemTime::now(),
@@ -465,7 +465,7 @@ mod tests {
     #[test]
     fn an_agent_with_the_incarnation_of_a_connected_gateway_takes_nothing_from_it() {
         let entry = |name: &str, reach| {
-            let directory = fipa_sds::MemoryDirectory::new(Mts::new("mts", GATEWAY));
+            let directory = fipa_sds::MemoryDirectory::new(MtsId::new("mts", GATEWAY));
             let agent = Registration::new(name, GATEWAY, Vec::new());
             let entry = directory.register(agent).unwrap();
             Arc::new(Entry {

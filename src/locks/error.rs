@@ -3,7 +3,7 @@
 use std::io;
 
 use fipa_acl::BuildError;
-use fipa_locking::{Failure, Algorithm, NameError, OptionsError, Refusal, Resource};
+use fipa_locking::{Algorithm, Failure, NameError, OptionsError, Refusal, Resource};
 use fipa_transport::Forked;
 use fipa_transport::threads::ThreadError;
 

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::{ErrorChain, Message};
-use fipa_locking::{Ending, Fence, Grant, Algorithm, Options, OwnerState, Resource};
+use fipa_locking::{Algorithm, Ending, Fence, Grant, Options, OwnerState, Resource};
 use fipa_sds::{Entry, RegisterError, Role};
 use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Performative, escape, escape_name};
 use fipa_locking::{
-    Action, AnyAlgorithm, ClaimId, Event, Failure, Fence, Algorithm, LockDialect, LockMessage, Locks,
-    Millis, Peer, Resource, codec,
+    Action, Algorithm, AnyAlgorithm, ClaimId, Event, Failure, Fence, LockDialect, LockMessage,
+    Locks, Millis, Peer, Resource, codec,
 };
 use fipa_mts::letter_for;
 use fipa_sds::{Change, Entry, Reach, Role, Watch};

@@ -349,7 +349,7 @@ fn is_move(before: &Entry, after: &Entry) -> bool {
 mod tests {
     use std::time::SystemTime;
 
-    use fipa_sds::{Mts, Role, Source};
+    use fipa_sds::{MtsId, Role, Source};
 
     use super::*;
 
@@ -365,7 +365,7 @@ mod tests {
             agent_type: String::new(),
             incarnation: id(registration),
             locations: Vec::new(),
-            mts: Mts::new(mts, id(service)),
+            mts: MtsId::new(mts, id(service)),
             description: String::new(),
             registered: SystemTime::UNIX_EPOCH,
             source: Source::Host,

@@ -91,13 +91,13 @@ pub(super) fn single(
 
 #[cfg(test)]
 mod tests {
-    use fipa_sds::{Members, MemoryDirectory, Mts, Registration, Role};
+    use fipa_sds::{Members, MemoryDirectory, MtsId, Registration, Role};
     use fipa_transport::Incarnation;
 
     use super::*;
 
     fn directory() -> MemoryDirectory {
-        let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));
+        let directory = MemoryDirectory::new(MtsId::new("mts", Incarnation::random()));
         let register = |name: &str, role: Role| {
             let agent = Registration {
                 role,

@@ -193,7 +193,7 @@ impl TestService {
             #[cfg(feature = "quic")]
             quic.clone().map(|it| it as Arc<dyn Transport>),
         ];
-        let directory = Arc::new(MemoryDirectory::new(fipa_sds::Mts::new(name, incarnation)));
+        let directory = Arc::new(MemoryDirectory::new(fipa_sds::MtsId::new(name, incarnation)));
         let core = CoreConfig {
             forwards,
             ..CoreConfig::new(name, incarnation, order.to_vec())

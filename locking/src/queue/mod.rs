@@ -13,7 +13,7 @@
 use std::collections::VecDeque;
 
 use crate::owner::OwnerStep;
-use crate::{Act, Conversation, LockDialect, Gate, Millis, Peer};
+use crate::{Act, Conversation, Gate, LockDialect, Millis, Peer};
 
 /// Highest place in an owner's queue that a member is told.
 pub const MAX_PLACE: u32 = 8;

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use fipa_acl::{Letter, Payload};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Principal,
     Reaction, Stream, Ticket,
@@ -134,7 +134,7 @@ impl Crowd {
 
 /// A directory with every agent at one of the peers.
 fn directory(names: &[Arc<str>]) -> Arc<MemoryDirectory> {
-    let directory = MemoryDirectory::new(Mts::new("here-mts", HERE));
+    let directory = MemoryDirectory::new(MtsId::new("here-mts", HERE));
     let peers: Vec<Location> = (0..names.len() / AGENTS).map(peer).collect();
     for (n, (name, location)) in names.iter().zip(peers.iter().cycle()).enumerate() {
         let locations = vec![location.clone()];

@@ -53,13 +53,13 @@ impl Departed {
 
 #[cfg(test)]
 mod tests {
-    use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+    use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
     use std::sync::Arc;
 
     use super::*;
 
     fn entry() -> Entry {
-        let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(1)));
+        let directory = MemoryDirectory::new(MtsId::new("mts", Incarnation::from_u64(1)));
         let arm = Registration::new("arm", Incarnation::from_u64(7), Vec::new());
         directory.register(arm).unwrap();
         Entry::clone(&Arc::clone(&directory.lookup("arm").unwrap()))

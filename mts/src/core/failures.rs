@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Dialect, ErrorChain, Letter};
-use fipa_sds::{Entry, Mts, Reach, Role, Source};
+use fipa_sds::{Entry, MtsId, Reach, Role, Source};
 use fipa_transport::{
     FailureReason, Incarnation, Kind, LegacySource, Location, PeerId, Signature, Stream, log_limit,
     quota_address,
@@ -272,7 +272,7 @@ fn stated_entry(core: &Core, agent: &AgentId, from: LegacySource) -> Option<Arc<
         agent_type: String::new(),
         incarnation: Incarnation::UNKNOWN,
         locations,
-        mts: Mts::new(agent.name(), Incarnation::UNKNOWN),
+        mts: MtsId::new(agent.name(), Incarnation::UNKNOWN),
         description: String::new(),
         registered: SystemTime::UNIX_EPOCH,
         source: Source::Contact,
@@ -304,7 +304,7 @@ mod tests {
             contact_networks: networks.iter().map(|it| it.parse().unwrap()).collect(),
             ..crate::core::CoreConfig::new("mts", Incarnation::from_u64(1), Vec::new())
         };
-        let directory = fipa_sds::MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(1)));
+        let directory = fipa_sds::MemoryDirectory::new(MtsId::new("mts", Incarnation::from_u64(1)));
         let mut core = Core::new(config, fipa_sds::Directory::view(&directory));
         core.listens_at(vec!["10.0.0.1:7778".parse().unwrap()]);
         core

@@ -14,7 +14,7 @@ use fipa_transport::{
 use super::label::Label;
 use super::rules::{self, Offer};
 use super::{CoreConfig, MAX_DEADLINE, work};
-use crate::gate::{Link, Source};
+use crate::gate::{LetterSource, Link};
 use crate::{AccessGate, LetterParts};
 
 /// A letter taken from an agent's queue.
@@ -317,7 +317,7 @@ pub(super) fn link_of(via: Kind, from: &Hop) -> Link {
     Link {
         via,
         service: from.location.incarnation(),
-        source: Source::of(from),
+        source: LetterSource::of(from),
     }
 }
 

@@ -342,7 +342,7 @@ impl Principals {
 
 #[cfg(test)]
 mod tests {
-    use fipa_sds::{MemoryDirectory, Mts};
+    use fipa_sds::{MemoryDirectory, MtsId};
     use fipa_transport::Mandate;
 
     use super::*;
@@ -369,7 +369,7 @@ mod tests {
     }
 
     fn no_agents() -> MemoryDirectory {
-        MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(1)))
+        MemoryDirectory::new(MtsId::new("mts", Incarnation::from_u64(1)))
     }
 
     #[test]

@@ -351,7 +351,7 @@ impl Core {
         let unproved = Link {
             via,
             service: Incarnation::UNKNOWN,
-            source: gate::Source::at(from.address),
+            source: gate::LetterSource::at(from.address),
         };
         if let Err(why) = self.ask_gate(now, &entry.name, parts.as_ref(), unproved) {
             let why = (FailureReason::Refused, why);

@@ -12,5 +12,5 @@
 mod joiner;
 pub mod record;
 
-pub use joiner::{Event, Fate, Joiner, Passage, Source};
+pub use joiner::{Event, Fate, Joiner, Passage, RecordSource};
 pub use record::{Record, RecordError};

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
-use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
+use fipa_sds::{Directory, Entry, MtsId, Reach, Role, Source, Subscriber};
 use fipa_transport::{Incarnation, Kind, Location};
 use parking_lot::Mutex;
 
@@ -179,7 +179,7 @@ impl View {
             agent_type: String::new(),
             incarnation: registered.incarnation,
             locations: locations.to_vec(),
-            mts: Mts::new("mts", registered.mts),
+            mts: MtsId::new("mts", registered.mts),
             description: String::new(),
             registered: SystemTime::UNIX_EPOCH,
             source: Source::Host,

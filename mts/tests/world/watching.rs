@@ -7,7 +7,7 @@ use std::time::{Instant, SystemTime};
 
 use fipa_mts::core::Notice;
 use fipa_mts::watch::record::{self, Wish};
-use fipa_mts::watch::{Event, Fate, Joiner, Passage, Record, Source};
+use fipa_mts::watch::{Event, Fate, Joiner, Passage, Record, RecordSource};
 use fipa_transport::{Incarnation, Outcome, wire};
 
 use super::gates::number_in;
@@ -33,7 +33,7 @@ impl Watching {
         // The content begins with the number of the letter.
         let bytes = record::of(notice, Wish { content: 64 }, utc);
         let record = Record::parse(&bytes.into()).map_err(|error| error.to_string())?;
-        self.joiner.handle(now, Source(process as u64), record);
+        self.joiner.handle(now, RecordSource(process as u64), record);
         while let Some(event) = self.joiner.poll_event(now) {
             self.see(event)?;
         }

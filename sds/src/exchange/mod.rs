@@ -41,7 +41,7 @@ use wire::{Changes, ExchangeMessage, Full};
 
 use crate::entry::time_of_millis;
 use crate::shares;
-use crate::{Entry, Mts, Reach, Role, Source};
+use crate::{Entry, MtsId, Reach, Role, Source};
 
 /// Ontology of the letters of the exchange.
 pub const EXCHANGE_ONTOLOGY: &str = "fipa-sds-exchange";
@@ -70,7 +70,7 @@ pub struct Exchange {
 /// The agents of a gateway that fell silent without a farewell.
 #[derive(Debug)]
 struct LostGateway {
-    mts: Mts,
+    mts: MtsId,
     peer: PeerId,
     agents: Vec<Arc<Entry>>,
     /// Time at which they are forgotten.
@@ -81,7 +81,7 @@ struct LostGateway {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Present {
     /// The gateway.
-    pub mts: Mts,
+    pub mts: MtsId,
     /// Locations at which it accepts letters.
     pub locations: Vec<Location>,
     /// The agents for which its links prove that it may speak. Entries of other agents are
@@ -94,7 +94,7 @@ pub struct Present {
 impl Present {
     /// Creates a gateway whose links prove nothing.
     #[must_use]
-    pub const fn unproved(mts: Mts, locations: Vec<Location>) -> Self {
+    pub const fn unproved(mts: MtsId, locations: Vec<Location>) -> Self {
         Self {
             mts,
             locations,
@@ -152,7 +152,7 @@ fn relocation_due(
 /// A gateway that is connected, or was until recently.
 #[derive(Debug)]
 struct Neighbor {
-    mts: Mts,
+    mts: MtsId,
     locations: Vec<Location>,
     mandate: Mandate,
     principal: Principal,
@@ -993,7 +993,7 @@ impl SyncState {
 }
 
 impl Neighbor {
-    fn new(mts: Mts, locations: Vec<Location>, due: Instant) -> Self {
+    fn new(mts: MtsId, locations: Vec<Location>, due: Instant) -> Self {
         Self {
             mts,
             locations,

@@ -148,7 +148,7 @@ mod tests {
     use fipa_transport::Incarnation;
 
     use super::*;
-    use crate::{Mts, Registration, Source};
+    use crate::{MtsId, Registration, Source};
 
     const LETTER: &str = concat!(
         r#"{"version":1,"tell":{"full":{"version":3,"first":true,"last":true,"agents":["#,
@@ -158,7 +158,7 @@ mod tests {
     );
 
     fn agent(name: &str, number: u64, agent_type: &str, df: DfEntry) -> Agent {
-        let mts = Mts::new("mts", Incarnation::from_u64(1));
+        let mts = MtsId::new("mts", Incarnation::from_u64(1));
         let registration = Registration {
             agent_type: agent_type.to_owned(),
             registered: crate::entry::time_of_millis(1000),

@@ -18,7 +18,7 @@ use fipa_transport::{Incarnation, Location, PeerId};
 use serde::{Deserialize, Serialize};
 
 use crate::entry::{millis_of_time, time_of_millis};
-use crate::{Entry, EntryError, Mts, Reach, Role, Source};
+use crate::{Entry, EntryError, MtsId, Reach, Role, Source};
 
 const FORMAT: &str = "fipa-directory";
 const VERSION: u32 = 1;
@@ -32,7 +32,7 @@ pub(super) const MAX_ENTRIES: usize = 65_536;
 /// Largest file, in bytes.
 pub(super) const MAX_SIZE: usize = 32 * 1024 * 1024;
 
-pub(super) fn write<'a>(mts: &Mts, entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<u8> {
+pub(super) fn write<'a>(mts: &MtsId, entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<u8> {
     let written = Written {
         format: FORMAT.into(),
         version: VERSION,
@@ -88,7 +88,7 @@ pub(super) enum FileError {
 struct Written {
     format: String,
     version: u32,
-    mts: Mts,
+    mts: MtsId,
     entries: Vec<WrittenEntry>,
 }
 
@@ -118,7 +118,7 @@ impl WrittenEntry {
         }
     }
 
-    fn into_entry(self, mts: &Mts) -> Result<Entry, FileError> {
+    fn into_entry(self, mts: &MtsId) -> Result<Entry, FileError> {
         if !self.incarnation.is_known() {
             return Err(FileError::NoIncarnation(self.name));
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::host_dir::Name;
 use super::remote::RemoteAgents;
 use super::{file, remote};
-use crate::{Entry, Mts, View as _};
+use crate::{Entry, MtsId, View as _};
 
 /// Reads an entries file, writes it, asserts that reading it again gives the same, and returns it.
 ///
@@ -50,7 +50,7 @@ pub fn read_remote(bytes: &[u8]) {
     }
     let lost: Vec<Arc<Entry>> = agents.lost().to_vec();
     let Some(gateway) = all.first().map(|entry| match entry.reach {
-        crate::Reach::Remote { gateway } => Mts::new("mts", gateway),
+        crate::Reach::Remote { gateway } => MtsId::new("mts", gateway),
         crate::Reach::Local => panic!("an agent of another host is not local"),
     }) else {
         return;

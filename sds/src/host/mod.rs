@@ -41,7 +41,7 @@ use self::remote::RemoteAgents;
 use self::shared::Shared;
 use self::watcher::Watcher;
 use crate::{
-    DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Source, Subscriber,
+    DeregisterError, Directory, Entry, MtsId, RegisterError, Registration, Source, Subscriber,
     View as _,
 };
 
@@ -52,7 +52,7 @@ pub struct HostConfig {
     /// refused if another user owns it or may access it, or if it is a symbolic link.
     pub dir: PathBuf,
     /// The message transport service of this process.
-    pub mts: Mts,
+    pub mts: MtsId,
     /// Whether this process may publish agents of other hosts.
     pub gateway: bool,
     /// Whether this process is likely to end within a second. It then polls the directory: the kernel

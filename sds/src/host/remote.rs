@@ -41,7 +41,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::view::KeptEntries;
-use crate::{Entry, EntryError, MAX_NAME, Mts, Reach, Role, Source, View, shares};
+use crate::{Entry, EntryError, MAX_NAME, MtsId, Reach, Role, Source, View, shares};
 
 const FORMAT: &str = "fipa-remote";
 const VERSION: u32 = 2;
@@ -72,7 +72,7 @@ const KEPT: usize = 256;
 struct Header {
     format: String,
     version: u32,
-    gateway: Mts,
+    gateway: MtsId,
     locations: Vec<Location>,
 }
 
@@ -81,7 +81,7 @@ struct Header {
 struct Fields {
     #[serde(rename = "type", default, skip_serializing_if = "String::is_empty")]
     agent_type: String,
-    mts: Mts,
+    mts: MtsId,
     /// `None` if they are those in the header.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     locations: Option<Vec<Location>>,
@@ -96,7 +96,7 @@ struct Fields {
 /// Writes a file with these agents. Of several with one name or one incarnation, the last one holds that. If
 /// they do not fit, each gateway that has sent its agents to this one has a share, and so have the agents from
 /// each other source.
-pub(super) fn write(gateway: &Mts, agents: &[Arc<Entry>], lost: &[Arc<Entry>]) -> Vec<u8> {
+pub(super) fn write(gateway: &MtsId, agents: &[Arc<Entry>], lost: &[Arc<Entry>]) -> Vec<u8> {
     let locations = common_locations(agents);
     let mut holders = HashSet::new();
     let mut names: HashMap<&str, (&Entry, u8)> = HashMap::new();
@@ -692,7 +692,7 @@ mod tests {
             agent_type: text.to_owned(),
             incarnation: Incarnation::from_u64(7),
             locations: vec!["shm://1#0000000000000001".parse().unwrap()],
-            mts: Mts::new("mts", Incarnation::from_u64(gateway)),
+            mts: MtsId::new("mts", Incarnation::from_u64(gateway)),
             description: text.to_owned(),
             registered: std::time::UNIX_EPOCH,
             source: Source::Exchange,
@@ -705,7 +705,7 @@ mod tests {
     }
 
     fn written(agents: &[Arc<Entry>], lost: &[Arc<Entry>]) -> Vec<u8> {
-        let mts = Mts::new("gateway", Incarnation::from_u64(1));
+        let mts = MtsId::new("gateway", Incarnation::from_u64(1));
         write(&mts, agents, lost)
     }
 

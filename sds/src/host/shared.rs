@@ -14,7 +14,7 @@ use super::host_dir::{Guard, HostDir, Id, Name, Version};
 use super::remote::{self, RemoteAgents, RemoteError, RemoteLists};
 use super::{Cancellation, HostError, SocketId};
 use crate::table::Table;
-use crate::{Change, DeregisterError, Entry, Mts, RegisterError, Source, View, Watch};
+use crate::{Change, DeregisterError, Entry, MtsId, RegisterError, Source, View, Watch};
 
 /// The state behind a [`HostDirectory`](super::HostDirectory), shared with its task.
 ///
@@ -24,7 +24,7 @@ pub(super) struct Shared {
     /// Replaced when the directory was removed and joined again.
     host_dir: ArcSwap<HostDir>,
     pub(super) table: Table<Id>,
-    mts: Mts,
+    mts: MtsId,
     own: Mutex<OwnEntries>,
     others: Mutex<OtherProcesses>,
     /// Number of processes that have ended.
@@ -77,7 +77,7 @@ struct Gateway {
 }
 
 impl Shared {
-    pub(super) fn new(host_dir: HostDir, mts: Mts) -> Self {
+    pub(super) fn new(host_dir: HostDir, mts: MtsId) -> Self {
         Self {
             host_dir: ArcSwap::from_pointee(host_dir),
             table: Table::new(),

@@ -209,7 +209,7 @@ mod tests {
     use std::collections::{BTreeMap, VecDeque};
 
     use super::*;
-    use crate::{Members, Mts, Reach, Source};
+    use crate::{Members, MtsId, Reach, Source};
 
     /// Coalitions and their members.
     type State = BTreeMap<String, Vec<String>>;
@@ -222,7 +222,7 @@ mod tests {
             agent_type: String::new(),
             incarnation: Incarnation::from_u64(7),
             locations: Vec::new(),
-            mts: Mts::new("mts", gateway),
+            mts: MtsId::new("mts", gateway),
             description: String::new(),
             registered: std::time::UNIX_EPOCH,
             source: Source::Mdns,

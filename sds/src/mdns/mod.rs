@@ -44,8 +44,8 @@ pub use self::probe::{Multicast, probe};
 use self::relocations::Relocations;
 use crate::table::Table;
 use crate::{
-    DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Role, Source, Subscriber,
-    Updated,
+    DeregisterError, Directory, Entry, MtsId, RegisterError, Registration, Role, Source,
+    Subscriber, Updated,
 };
 
 /// The type of the records, 22 characters long.
@@ -63,7 +63,7 @@ const MAX_TXT: usize = 8000;
 #[derive(Debug, Clone)]
 pub struct MdnsConfig {
     /// The gateway that announces the registrations and accepts letters for them.
-    pub mts: Mts,
+    pub mts: MtsId,
     /// Interfaces to use, by name or address; an empty list means all, including loopback.
     pub interfaces: Vec<String>,
     /// The UDP port, by default 5353; another port makes a separate directory.
@@ -73,7 +73,7 @@ pub struct MdnsConfig {
 impl MdnsConfig {
     /// Creates a configuration with all interfaces and the standard port.
     #[must_use]
-    pub fn new(mts: Mts) -> Self {
+    pub fn new(mts: MtsId) -> Self {
         Self {
             mts,
             interfaces: Vec::new(),

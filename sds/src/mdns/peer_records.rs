@@ -201,7 +201,7 @@ impl PeerRecords {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Mts, Reach, Role, Source};
+    use crate::{MtsId, Reach, Role, Source};
 
     fn entry(number: u64, gateway: u64) -> Entry {
         let gateway = Incarnation::from_u64(gateway);
@@ -210,7 +210,7 @@ mod tests {
             agent_type: String::new(),
             incarnation: Incarnation::from_u64(number),
             locations: Vec::new(),
-            mts: Mts::new("mts", gateway),
+            mts: MtsId::new("mts", gateway),
             description: String::new(),
             registered: std::time::UNIX_EPOCH,
             source: Source::Mdns,

@@ -39,7 +39,7 @@ use std::time::SystemTime;
 use fipa_transport::{Incarnation, Kind, Location, LocationError, PeerId, Principal, Signature};
 
 use crate::entry::{millis_of_time, time_of_millis};
-use crate::{Entry, EntryError, Members, Mts, Reach, Role, Source};
+use crate::{Entry, EntryError, Members, MtsId, Reach, Role, Source};
 
 /// Maximum length in bytes of a value that the legacy peers write, and of one string in a record of
 /// this project.
@@ -275,7 +275,7 @@ fn own_entry(record: &Record<'_>) -> Result<Entry, RecordError> {
         incarnation: record.parsed("fipa-id")?,
         peer: PeerId::of(Principal::Unproved, known.first()),
         locations: known,
-        mts: Mts::new(record.parsed::<String>("fipa-mts")?, mts),
+        mts: MtsId::new(record.parsed::<String>("fipa-mts")?, mts),
         description: whole("fipa-description", "DESCRIPTION")?,
         registered: time_of_millis(record.parsed("fipa-time")?),
         source: Source::Mdns,
@@ -306,7 +306,7 @@ fn legacy_entry(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
         peer: PeerId::of(Principal::Unproved, locations.first()),
         locations,
         // Legacy records do not name the service; each agent may have its own.
-        mts: Mts::new(name.as_str(), Incarnation::UNKNOWN),
+        mts: MtsId::new(name.as_str(), Incarnation::UNKNOWN),
         name: name.into(),
         description: record.legacy_text("DESCRIPTION", Entry::MAX_DESCRIPTION),
         registered: time_of_millis(registered),
@@ -443,7 +443,7 @@ mod tests {
                 "tcp://[fe80::1]:7788".parse().unwrap(),
                 "tcp://10.0.0.2:7788#00000000000000ab".parse().unwrap(),
             ],
-            mts: Mts::new("crex-mts", gateway),
+            mts: MtsId::new("crex-mts", gateway),
             description: "left".to_owned(),
             registered: UNIX_EPOCH + Duration::from_millis(1_795_172_400_123),
             source: Source::Mdns,
@@ -748,7 +748,7 @@ mod tests {
             members in prop::collection::vec(any_text(200), 0..5),
             led: bool,
         ) -> Entry {
-            let mts = Mts::new(mts_name, Incarnation::from_u64(mts));
+            let mts = MtsId::new(mts_name, Incarnation::from_u64(mts));
             Entry {
                 name: name.into(),
                 agent_type,

@@ -121,7 +121,7 @@ pub(super) mod tests {
 
     use super::super::{MdnsConfig, MdnsDirectory};
     use super::*;
-    use crate::{Directory, Mts, Registration};
+    use crate::{Directory, MtsId, Registration};
 
     /// Opens a directory on loopback with a port of its own. In a single-threaded test its task
     /// does not run until the test awaits.
@@ -130,7 +130,7 @@ pub(super) mod tests {
         let config = MdnsConfig {
             interfaces: vec!["lo".to_owned()],
             port: free.unwrap().port(),
-            ..MdnsConfig::new(Mts::new("own", Incarnation::random()))
+            ..MdnsConfig::new(MtsId::new("own", Incarnation::random()))
         };
         MdnsDirectory::open(config).unwrap()
     }

@@ -269,13 +269,13 @@ mod tests {
     use super::super::packet::tests::{Part, answer};
     use super::super::restart::tests::directory;
     use super::*;
-    use crate::{Directory, Mts, Registration, Source};
+    use crate::{Directory, MtsId, Registration, Source};
 
     #[tokio::test]
     async fn records_of_a_gateway_stay_valid_while_its_beacons_match() {
         let directory = directory();
         let shared = &directory.shared;
-        let gateway = Mts::new("theirs", Incarnation::random());
+        let gateway = MtsId::new("theirs", Incarnation::random());
         let at = "tcp://127.0.0.1:7788#00000000000000aa".parse().unwrap();
         let arm = Registration::new("arm", Incarnation::random(), vec![at]);
         let properties = record::encode(&arm.into_entry(&gateway, Source::Mdns).unwrap());
@@ -315,7 +315,7 @@ mod tests {
         let at = "tcp://127.0.0.1:7788#00000000000000aa".parse().unwrap();
         let arm = Registration::new("arm", Incarnation::random(), vec![at]);
         directory.register(arm.clone()).unwrap();
-        let gateway = Mts::new("theirs", Incarnation::from_u64(1));
+        let gateway = MtsId::new("theirs", Incarnation::from_u64(1));
         let theirs = arm.into_entry(&gateway, Source::Mdns).unwrap();
         let label = || Arc::clone(&shared.own.lock().agents["arm"].fullname);
         let first = label();

@@ -2,7 +2,7 @@
 
 use std::net::UdpSocket;
 
-use fipa_sds::{MdnsConfig, MdnsDirectory, Mts};
+use fipa_sds::{MdnsConfig, MdnsDirectory, MtsId};
 use fipa_transport::Incarnation;
 
 /// An unused port, so that tests do not receive each other's packets.
@@ -15,7 +15,7 @@ pub fn open(port: u16, name: &str) -> MdnsDirectory {
     let config = MdnsConfig {
         interfaces: vec!["lo".to_owned()],
         port,
-        ..MdnsConfig::new(Mts::new(name, Incarnation::random()))
+        ..MdnsConfig::new(MtsId::new(name, Incarnation::random()))
     };
     MdnsDirectory::open(config).unwrap()
 }

@@ -2,7 +2,7 @@
 
 use std::net::IpAddr;
 
-use fipa_sds::{MdnsConfig, Mts, Multicast, probe};
+use fipa_sds::{MdnsConfig, MtsId, Multicast, probe};
 use fipa_transport::Incarnation;
 
 use super::{Area, Check, Severity};
@@ -19,7 +19,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let interfaces = config.discovery.interfaces.iter().map(ToString::to_string);
     let probed = probe(&MdnsConfig {
         interfaces: interfaces.collect(),
-        ..MdnsConfig::new(Mts::new("doctor", Incarnation::random()))
+        ..MdnsConfig::new(MtsId::new("doctor", Incarnation::random()))
     });
     match probed {
         Ok(found) if found.is_empty() => checks.push(AREA.problem(

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_mts::watch::record::{MAX_LEN, Wish};
-use fipa_mts::watch::{Record, RecordError, Source};
+use fipa_mts::watch::{Record, RecordError, RecordSource};
 use fipa_transport::log_limit;
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::mpsc;
@@ -14,10 +14,10 @@ use super::socket;
 
 /// An event on the connection of a process.
 pub(super) enum ProcessEvent {
-    Begin(Source, String),
-    Record(Source, Record),
-    Malformed(Source, RecordError),
-    End(Source),
+    Begin(RecordSource, String),
+    Record(RecordSource, Record),
+    Malformed(RecordSource, RecordError),
+    End(RecordSource),
 }
 
 /// Maximum number of connected processes.
@@ -32,7 +32,7 @@ pub(super) async fn run(listener: UnixListener, wish: Wish, events: mpsc::Sender
         match listener.accept().await {
             Ok((process, _)) if processes.len() < MAX_PROCESSES => {
                 number += 1;
-                processes.spawn(listen(process, Source(number), wish, events.clone()));
+                processes.spawn(listen(process, RecordSource(number), wish, events.clone()));
             }
             Ok(_) => log_limit::warn!(
                 "refused a process: {MAX_PROCESSES} processes, the maximum, are watched already"
@@ -48,7 +48,7 @@ pub(super) async fn run(listener: UnixListener, wish: Wish, events: mpsc::Sender
 
 async fn listen(
     process: UnixStream,
-    source: Source,
+    source: RecordSource,
     wish: Wish,
     events: mpsc::Sender<ProcessEvent>,
 ) {

@@ -75,7 +75,7 @@ impl Watcher {
         config.check()?;
         tokio::runtime::Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let name = format!("fipa-watch-{}", std::process::id());
-        let own = fipa_sds::Mts::new(name, Incarnation::random());
+        let own = fipa_sds::MtsId::new(name, Incarnation::random());
         let membership = Membership::default();
         let (dir, host) = membership::join(&config.domain, &own, membership, &Cancellation::new())?;
         let socket = host.listen().inspect_err(|_| leave(&host, &dir))?;

@@ -27,7 +27,7 @@ const SEND_BUFFER: usize = 1 << 20;
 
 /// The watchers of this process.
 pub(crate) struct Watchers {
-    mts: fipa_sds::Mts,
+    mts: fipa_sds::MtsId,
     gateway: bool,
     connections: Mutex<Vec<Arc<Connection>>>,
     /// Serializes changes of `connections`, so that the service is watched exactly while there is a
@@ -45,7 +45,7 @@ impl Tap for Watchers {
 }
 
 impl Watchers {
-    pub(crate) fn new(mts: &fipa_sds::Mts, gateway: bool) -> Self {
+    pub(crate) fn new(mts: &fipa_sds::MtsId, gateway: bool) -> Self {
         Self {
             mts: mts.clone(),
             gateway,

@@ -11,7 +11,7 @@ use proptest::prelude::*;
 
 use super::reader::Reader;
 use super::{
-    Check, Config, ConfigError, Effective, Interface, Origin, Peer, PlatformAgent, Route, Sources,
+    Check, Config, ConfigError, Effective, Interface, Origin, PeerConfig, PlatformAgent, RouteConfig, Sources,
 };
 
 /// Loads a text as if it stood in `./fipa.toml`.
@@ -445,7 +445,7 @@ prop_compose! {
         config.mts.raise_open_files = answer;
         config.routes = routes
             .into_iter()
-            .map(|(receiver, transports)| Route { receiver, transports })
+            .map(|(receiver, transports)| RouteConfig { receiver, transports })
             .collect();
         // A route needs at least one transport that is on.
         config.routes.retain(|route| {
@@ -461,7 +461,7 @@ prop_compose! {
         config.discovery.interfaces = interfaces.into_iter().map(Interface::Name).collect();
         config.discovery.peers = peers
             .into_iter()
-            .map(|(name, port)| Peer {
+            .map(|(name, port)| PeerConfig {
                 name,
                 locations: vec![format!("tcp://host:{port}").parse().unwrap()],
             })

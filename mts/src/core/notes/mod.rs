@@ -18,7 +18,7 @@ use fipa_transport::{AttemptId, Body, Location, Parcel, Stream};
 
 use super::ids::LaneId;
 use super::work;
-use crate::gate::Source;
+use crate::gate::LetterSource;
 use crate::{Map, Set};
 
 /// Maximum number of reports that are repeated, and of one source. A source with few of them is always served.
@@ -50,7 +50,7 @@ pub(crate) struct Note {
     /// Time of the last transmission, if an answer is expected.
     sent: Option<Instant>,
     /// The share of which it is a part, and the end of its repetitions.
-    repeated: Option<(Source, Instant)>,
+    repeated: Option<(LetterSource, Instant)>,
 }
 
 impl Note {
@@ -107,10 +107,10 @@ impl Note {
 }
 
 /// The source to whose share the reports for a location count.
-fn source_of(location: &Location) -> Source {
+fn source_of(location: &Location) -> LetterSource {
     match location.kind().is_host_local() {
-        true => Source::Process(location.incarnation()),
-        false => Source::unproved(location),
+        true => LetterSource::Process(location.incarnation()),
+        false => LetterSource::unproved(location),
     }
 }
 
@@ -185,7 +185,7 @@ enum Due {
     /// Send notes that wait for room at this location.
     Room(Location),
     /// End the pause of this source.
-    Pause(Source),
+    Pause(LetterSource),
 }
 
 impl Ord for Timer {
@@ -212,9 +212,9 @@ impl Eq for Timer {}
 #[derive(Debug, Default)]
 pub(super) struct Notes {
     without_room: Map<Location, WithoutRoom>,
-    unanswered: Map<Source, Unanswered>,
+    unanswered: Map<LetterSource, Unanswered>,
     /// Number of reports that are repeated, of each source and of all.
-    shares: Map<Source, usize>,
+    shares: Map<LetterSource, usize>,
     repeated: usize,
     /// Hand-overs whose end was reported and neither acknowledged nor refused yet.
     open_reports: Set<(Stream, u64, u64)>,
@@ -345,7 +345,7 @@ impl Notes {
     }
 
     /// Begins the next pause of a source, unless one has not ended.
-    fn pause(&mut self, now: Instant, source: Source) {
+    fn pause(&mut self, now: Instant, source: LetterSource) {
         let Some(unanswered) = self.unanswered.get_mut(&source) else {
             return;
         };
@@ -361,7 +361,7 @@ impl Notes {
     }
 
     /// Returns the next report that a source has not answered.
-    fn next_unanswered(&mut self, now: Instant, source: Source) -> Option<Note> {
+    fn next_unanswered(&mut self, now: Instant, source: LetterSource) -> Option<Note> {
         loop {
             let unanswered = self.unanswered.get_mut(&source)?;
             let note = unanswered.reports.pop_front()?;

@@ -12,7 +12,7 @@ use super::super::ids::LaneId;
 use super::super::lane::PauseEnd;
 use super::super::{Core, Now, work};
 use super::{AFTER_ANSWER, Due, Note, PROBES, ROOM_TRIES, TIMERS_AT_ONCE, Timer, source_of};
-use crate::gate::Source;
+use crate::gate::LetterSource;
 
 impl AttemptTable {
     /// Sends a note.
@@ -50,7 +50,7 @@ impl AttemptTable {
     }
 
     /// Repeats at most this number of reports that a source has not answered.
-    fn repeat_some(&mut self, now: Instant, source: Source, most: usize) {
+    fn repeat_some(&mut self, now: Instant, source: LetterSource, most: usize) {
         for _ in 0..most {
             let Some(note) = self.notes.next_unanswered(now, source) else {
                 break;
@@ -247,7 +247,7 @@ impl Core {
         self.table.notes.watch_room(now.instant, location);
     }
 
-    fn pause_ended(&mut self, now: Now, source: Source, at: Instant) {
+    fn pause_ended(&mut self, now: Now, source: LetterSource, at: Instant) {
         let unanswered = self.table.notes.unanswered.get_mut(&source);
         if let Some(unanswered) = unanswered.filter(|it| it.due == Some(at)) {
             unanswered.due = None;

@@ -31,7 +31,7 @@ const MAX_PROCESSES: usize = 4096;
 
 /// A process that sends records, by a number that the watcher chooses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct Source(pub u64);
+pub struct RecordSource(pub u64);
 
 /// The known data of one letter to one receiver.
 #[derive(Debug, Clone)]
@@ -138,7 +138,7 @@ pub struct Joiner {
     /// Letters that were reported, in order.
     reported: VecDeque<Key>,
     early: HashMap<Key, (Outcome, bool)>,
-    processes: HashMap<Source, Process>,
+    processes: HashMap<RecordSource, Process>,
     events: VecDeque<Event>,
     arrived: u64,
     number: u64,
@@ -170,7 +170,7 @@ impl Joiner {
     }
 
     /// Adds a process, with this name until its greeting arrives.
-    pub fn handle_begin(&mut self, from: Source, name: impl Into<Arc<str>>) {
+    pub fn handle_begin(&mut self, from: RecordSource, name: impl Into<Arc<str>>) {
         if self.processes.len() < MAX_PROCESSES {
             let name = name.into();
             let mts = None;
@@ -179,14 +179,14 @@ impl Joiner {
     }
 
     /// Handles invalid data of a process, whose further records are then ignored.
-    pub fn handle_malformed(&mut self, from: Source, why: RecordError) {
+    pub fn handle_malformed(&mut self, from: RecordSource, why: RecordError) {
         let process = self.name(from);
         self.events.push_back(Event::Refused { process, why });
         self.handle_end(from);
     }
 
     /// Handles a record of a process.
-    pub fn handle(&mut self, now: Instant, from: Source, record: Record) {
+    pub fn handle(&mut self, now: Instant, from: RecordSource, record: Record) {
         let Record { at, lost, body } = record;
         if let RecordBody::Hello {
             name, incarnation, ..
@@ -220,7 +220,7 @@ impl Joiner {
     }
 
     /// Removes a process.
-    pub fn handle_end(&mut self, from: Source) {
+    pub fn handle_end(&mut self, from: RecordSource) {
         self.processes.remove(&from);
     }
 
@@ -229,7 +229,7 @@ impl Joiner {
         self.processes.values().filter_map(|process| process.mts)
     }
 
-    fn name(&self, of: Source) -> Arc<str> {
+    fn name(&self, of: RecordSource) -> Arc<str> {
         let process = self.processes.get(&of);
         process.map_or_else(|| "a process".into(), |process| Arc::clone(&process.name))
     }

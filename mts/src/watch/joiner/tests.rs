@@ -5,9 +5,9 @@ use fipa_transport::FailureReason;
 
 use super::*;
 
-const A: Source = Source(1);
-const B: Source = Source(2);
-const GATEWAY: Source = Source(3);
+const A: RecordSource = RecordSource(1);
+const B: RecordSource = RecordSource(2);
+const GATEWAY: RecordSource = RecordSource(3);
 
 fn id(sender: u64, sequence: u64) -> LetterId {
     LetterId {
@@ -241,7 +241,7 @@ fn each_letter_is_reported_once_and_in_order() {
     for seed in 0..300 {
         let mut random = fastrand::Rng::with_seed(seed);
         let start = Instant::now();
-        let mut arrivals: Vec<(u64, Source, Record)> = Vec::new();
+        let mut arrivals: Vec<(u64, RecordSource, Record)> = Vec::new();
         let mut expected: HashMap<Key, Option<Outcome>> = HashMap::new();
         for ms in 0..60 {
             let (sender, sequence) = (random.u64(1..4), ms + 1);
