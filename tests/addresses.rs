@@ -32,7 +32,10 @@ fn service(name: &str) -> (Mts, Arc<MemoryDirectory>, Location) {
     config.processes = true;
     config.limits.connect_timeout = patient;
     let transport = Arc::new(TcpTransport::new(config, Handle::current()));
-    let directory = Arc::new(MemoryDirectory::new(fipa_sds::MtsId::new(name, incarnation)));
+    let directory = Arc::new(MemoryDirectory::new(fipa_sds::MtsId::new(
+        name,
+        incarnation,
+    )));
     let started = Mts::start(
         CoreConfig {
             attempt_timeout: patient,

@@ -26,7 +26,7 @@ use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Reaction,
     Sink, Stream, Transport,
 };
-use fipa_transport_net::{Identity, Limits, QuicConfig, QuicTransport, TcpConfig, TcpTransport};
+use fipa_transport_net::{Identity, NetLimits, QuicConfig, QuicTransport, TcpConfig, TcpTransport};
 use parking_lot::Mutex;
 use services::links::{Link, LinkState};
 use services::{ARM, ROVER, Security, TestService, host, letter, mutual_keys, number};
@@ -492,7 +492,7 @@ impl RepeatingPeer {
             domain: "elsewhere".into(),
             host: "elsewhere".into(),
         };
-        let (listen, limits) = (Vec::new(), Limits::default());
+        let (listen, limits) = (Vec::new(), NetLimits::default());
         let transport: Arc<dyn Transport> = match kind {
             Kind::Quic => {
                 let config = QuicConfig {

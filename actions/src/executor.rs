@@ -22,7 +22,7 @@ const MAX_TEXT: usize = 1_024;
 
 /// Bounds and times of an [`Executor`].
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Limits {
+pub struct ActionLimits {
     /// Maximum number of goals that run or wait.
     pub goals: usize,
     /// Maximum number of goals of one client that run or wait, and of its conversations about goals.
@@ -42,7 +42,7 @@ pub struct Limits {
     pub grace: u64,
 }
 
-impl Default for Limits {
+impl Default for ActionLimits {
     fn default() -> Self {
         Self {
             goals: 1_024,
@@ -205,7 +205,7 @@ pub struct Running {
 /// The goals of one agent.
 #[derive(Debug, Default)]
 pub struct Executor {
-    limits: Limits,
+    limits: ActionLimits,
     offers: BTreeMap<String, Offer>,
     goals: HashMap<u64, Record>,
     ids: HashMap<(Arc<str>, String), u64>,
@@ -284,7 +284,7 @@ enum State {
 impl Executor {
     /// Creates an executor without actions.
     #[must_use]
-    pub fn new(limits: Limits) -> Self {
+    pub fn new(limits: ActionLimits) -> Self {
         Self {
             limits,
             ..Self::default()

@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 
 use crate::description::ActionDescription;
 use crate::language::{Language, LanguageError};
-use crate::message::{Answer, Ask, Failure, Goal, GoalStatus, Refusal};
+use crate::message::{ActionAnswer, Ask, Failure, Goal, GoalStatus, Refusal};
 use crate::types::OBJECT;
 
 /// The key of the function symbol of an object.
@@ -120,40 +120,46 @@ impl Language for Json {
         &self,
         _robot: &AgentId,
         _to: &Ask,
-        answer: &Answer,
+        answer: &ActionAnswer,
     ) -> Result<Vec<u8>, LanguageError> {
         let json = match answer.clone() {
-            Answer::Agreed { queued } => {
+            ActionAnswer::Agreed { queued } => {
                 JsonAnswer::Agreed(if queued { "queued" } else { "executing" }.to_owned())
             }
-            Answer::Done(None) => JsonAnswer::Done,
-            Answer::Done(Some(value)) => JsonAnswer::Result(json(&value)?),
-            Answer::Refused(reason) => JsonAnswer::Refused(reason),
-            Answer::Failed(reason) => JsonAnswer::Failed(reason),
-            Answer::Actions(all) => JsonAnswer::Actions(all),
-            Answer::Status(all) => JsonAnswer::Status(all),
+            ActionAnswer::Done(None) => JsonAnswer::Done,
+            ActionAnswer::Done(Some(value)) => JsonAnswer::Result(json(&value)?),
+            ActionAnswer::Refused(reason) => JsonAnswer::Refused(reason),
+            ActionAnswer::Failed(reason) => JsonAnswer::Failed(reason),
+            ActionAnswer::Actions(all) => JsonAnswer::Actions(all),
+            ActionAnswer::Status(all) => JsonAnswer::Status(all),
         };
         Ok(serde_json::to_vec(&json)?)
     }
 
-    fn read_answer(&self, to: &Ask, bytes: &[u8]) -> Result<Answer, LanguageError> {
+    fn read_answer(&self, to: &Ask, bytes: &[u8]) -> Result<ActionAnswer, LanguageError> {
         match (serde_json::from_slice(bytes)?, to) {
             (JsonAnswer::Agreed(state), Ask::Goal(_)) => {
                 let queued = state == "queued";
-                Ok(Answer::Agreed { queued })
+                Ok(ActionAnswer::Agreed { queued })
             }
-            (JsonAnswer::Done, Ask::Goal(_)) => Ok(Answer::Done(None)),
-            (JsonAnswer::Result(value), Ask::Goal(_)) => Ok(Answer::Done(Some(term(value)?))),
-            (JsonAnswer::Actions(all), Ask::Actions) => Ok(Answer::Actions(all)),
-            (JsonAnswer::Status(all), Ask::Status | Ask::StatusOf(_)) => Ok(Answer::Status(all)),
+            (JsonAnswer::Done, Ask::Goal(_)) => Ok(ActionAnswer::Done(None)),
+            (JsonAnswer::Result(value), Ask::Goal(_)) => Ok(ActionAnswer::Done(Some(term(value)?))),
+            (JsonAnswer::Actions(all), Ask::Actions) => Ok(ActionAnswer::Actions(all)),
+            (JsonAnswer::Status(all), Ask::Status | Ask::StatusOf(_)) => {
+                Ok(ActionAnswer::Status(all))
+            }
             _ => Err(LanguageError::Form("an answer to this message")),
         }
     }
 
-    fn read_rejection(&self, is_refusal: bool, bytes: &[u8]) -> Result<Answer, LanguageError> {
+    fn read_rejection(
+        &self,
+        is_refusal: bool,
+        bytes: &[u8],
+    ) -> Result<ActionAnswer, LanguageError> {
         match (serde_json::from_slice(bytes)?, is_refusal) {
-            (JsonAnswer::Refused(reason), true) => Ok(Answer::Refused(reason)),
-            (JsonAnswer::Failed(reason), false) => Ok(Answer::Failed(reason)),
+            (JsonAnswer::Refused(reason), true) => Ok(ActionAnswer::Refused(reason)),
+            (JsonAnswer::Failed(reason), false) => Ok(ActionAnswer::Failed(reason)),
             _ => Err(LanguageError::Form("a refusal or a failure")),
         }
     }

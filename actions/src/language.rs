@@ -5,7 +5,7 @@ use std::fmt;
 use fipa_acl::AgentId;
 use fipa_content::{ParseError, PrintError, ReadError, SerializeError};
 
-use crate::message::{Answer, Ask};
+use crate::message::{ActionAnswer, Ask};
 use crate::{Json, Sl};
 
 /// A content language of messages about actions. The performative and the protocol of a message are
@@ -34,20 +34,21 @@ pub trait Language: fmt::Debug + Send + Sync {
         &self,
         robot: &AgentId,
         to: &Ask,
-        answer: &Answer,
+        answer: &ActionAnswer,
     ) -> Result<Vec<u8>, LanguageError>;
 
     /// Reads the `agree` or `inform` of a robot to a message.
     ///
     /// # Errors
     /// If the bytes are not such an answer.
-    fn read_answer(&self, to: &Ask, bytes: &[u8]) -> Result<Answer, LanguageError>;
+    fn read_answer(&self, to: &Ask, bytes: &[u8]) -> Result<ActionAnswer, LanguageError>;
 
     /// Reads the `refuse` or `failure` of a robot.
     ///
     /// # Errors
     /// If the bytes are not such an answer.
-    fn read_rejection(&self, is_refusal: bool, bytes: &[u8]) -> Result<Answer, LanguageError>;
+    fn read_rejection(&self, is_refusal: bool, bytes: &[u8])
+    -> Result<ActionAnswer, LanguageError>;
 }
 
 /// Returns the content language with this name: that of `language` of a message, FIPA-SL without one.

@@ -7,7 +7,7 @@
 //!
 //! * [`ActionDescription`] describes an action: its parameters with types, units, ranges and defaults,
 //!   and its result. [`Type::of`] derives the type from a Rust type with serde.
-//! * [`Ask`] and [`Answer`] are the contents of messages. A [`Language`] writes and reads them: FIPA-SL
+//! * [`Ask`] and [`ActionAnswer`] are the contents of messages. A [`Language`] writes and reads them: FIPA-SL
 //!   ([`Sl`]) or JSON ([`Json`]); [`language`] finds one by its name.
 //! * [`ActionDescription::admit`] checks the arguments of a [`Goal`]; a [`Refusal`] names the parameter
 //!   and the reason.
@@ -53,12 +53,13 @@ mod types;
 
 pub use description::{ActionDescription, ParameterDescription, Policy, Range};
 pub use executor::{
-    Cause, Check, Executor, Gate, Limits, OfferOptions, OfferRefused, Orphans, Output, Running,
+    ActionLimits, Cause, Check, Executor, Gate, OfferOptions, OfferRefused, Orphans, Output,
+    Running,
 };
 pub use json::Json;
 pub use language::{Language, LanguageError, language};
 pub use message::{
-    Answer, Ask, Failure, Goal, GoalError, GoalState, GoalStatus, Progress, Refusal,
+    ActionAnswer, Ask, Failure, Goal, GoalError, GoalState, GoalStatus, Progress, Refusal,
 };
 pub use sl::Sl;
 pub use types::{Field, Mismatch, Type};

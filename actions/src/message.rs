@@ -112,7 +112,7 @@ fn property(term: Term<'static>) -> Option<Parameter<'static>> {
 /// The content of a message from a robot.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
-pub enum Answer {
+pub enum ActionAnswer {
     /// The goal is accepted (`agree`). Whether it waits for others.
     Agreed {
         /// Whether the goal waits in the queue.

@@ -9,7 +9,7 @@ use fipa_content::{
 };
 
 use crate::language::{Language, LanguageError};
-use crate::message::{Answer, Ask, Goal, parameter};
+use crate::message::{ActionAnswer, Ask, Goal, parameter};
 
 /// The predicate of offered actions: `(offers agent ?action)`.
 const OFFERS: &str = "offers";
@@ -48,37 +48,43 @@ impl Language for Sl {
         &self,
         robot: &AgentId,
         to: &Ask,
-        answer: &Answer,
+        answer: &ActionAnswer,
     ) -> Result<Vec<u8>, LanguageError> {
         let reference = || action(robot, reference(to));
         let content = match answer {
-            Answer::Agreed { queued } => {
+            ActionAnswer::Agreed { queued } => {
                 let state = if *queued { "queued" } else { "executing" };
                 Content::of_refusal(reference(), Wff::Proposition(state.into()))
             }
-            Answer::Done(None) => Wff::done(reference()).into(),
-            Answer::Done(Some(value)) => {
+            ActionAnswer::Done(None) => Wff::done(reference()).into(),
+            ActionAnswer::Done(Some(value)) => {
                 let of = Box::new(Term::from(reference()));
                 Wff::Result(of, Box::new(value.clone())).into()
             }
-            Answer::Refused(reason) => Content::of_refusal(reference(), Wff::from_value(reason)?),
-            Answer::Failed(reason) => Content::of_refusal(reference(), Wff::from_value(reason)?),
-            Answer::Actions(all) => query(robot, to).answer_all(all)?,
-            Answer::Status(all) => query(robot, to).answer_all(all)?,
+            ActionAnswer::Refused(reason) => {
+                Content::of_refusal(reference(), Wff::from_value(reason)?)
+            }
+            ActionAnswer::Failed(reason) => {
+                Content::of_refusal(reference(), Wff::from_value(reason)?)
+            }
+            ActionAnswer::Actions(all) => query(robot, to).answer_all(all)?,
+            ActionAnswer::Status(all) => query(robot, to).answer_all(all)?,
         };
         Ok(Printer::new().print(&content)?)
     }
 
-    fn read_answer(&self, to: &Ask, bytes: &[u8]) -> Result<Answer, LanguageError> {
+    fn read_answer(&self, to: &Ask, bytes: &[u8]) -> Result<ActionAnswer, LanguageError> {
         let content = Content::parse(bytes)?;
         if let Ask::Goal(_) = to {
             if let Ok((_, Wff::Proposition(state))) = content.refusal() {
                 let queued = state == "queued";
-                return Ok(Answer::Agreed { queued });
+                return Ok(ActionAnswer::Agreed { queued });
             }
             return match content.wff()? {
-                Wff::Done(..) => Ok(Answer::Done(None)),
-                Wff::Result(_, value) => Ok(Answer::Done(Some(Term::clone(value).into_owned()))),
+                Wff::Done(..) => Ok(ActionAnswer::Done(None)),
+                Wff::Result(_, value) => {
+                    Ok(ActionAnswer::Done(Some(Term::clone(value).into_owned())))
+                }
                 _ => Err(LanguageError::Form("((done …)) or ((result …))")),
             };
         }
@@ -88,18 +94,22 @@ impl Language for Sl {
         };
         let read = |error| LanguageError::Read(ReadError::Value(error));
         match to {
-            Ask::Actions => value.read().map(Answer::Actions).map_err(read),
-            _ => value.read().map(Answer::Status).map_err(read),
+            Ask::Actions => value.read().map(ActionAnswer::Actions).map_err(read),
+            _ => value.read().map(ActionAnswer::Status).map_err(read),
         }
     }
 
-    fn read_rejection(&self, is_refusal: bool, bytes: &[u8]) -> Result<Answer, LanguageError> {
+    fn read_rejection(
+        &self,
+        is_refusal: bool,
+        bytes: &[u8],
+    ) -> Result<ActionAnswer, LanguageError> {
         let content = Content::parse(bytes)?;
         let (_, reason) = content.refusal()?;
         let read = |error| LanguageError::Read(ReadError::Value(error));
         match is_refusal {
-            true => reason.read().map(Answer::Refused).map_err(read),
-            false => reason.read().map(Answer::Failed).map_err(read),
+            true => reason.read().map(ActionAnswer::Refused).map_err(read),
+            false => reason.read().map(ActionAnswer::Failed).map_err(read),
         }
     }
 }

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use fipa_actions::{
-    ActionDescription, Cause, Executor, Failure, Goal, GoalState, Limits, OfferOptions,
+    ActionDescription, ActionLimits, Cause, Executor, Failure, Goal, GoalState, OfferOptions,
     OfferRefused, Orphans, Output, ParameterDescription, Policy, Progress, Refusal,
 };
 use fipa_content::{Parameter, Term};
@@ -18,7 +18,7 @@ fn action(name: &str, policy: Policy) -> ActionDescription {
 }
 
 fn with(policy: Policy) -> Executor {
-    let mut executor = Executor::new(Limits::default());
+    let mut executor = Executor::new(ActionLimits::default());
     let options = OfferOptions::default();
     executor.offer(action("drive", policy), options).unwrap();
     executor
@@ -176,7 +176,7 @@ fn a_goal_that_is_sent_again_runs_once() {
     executor.request(4, 5, "arm", "a", goal("")).unwrap();
     started(&mut executor);
     // The outcome is stored for a while.
-    let kept = Limits::default().kept;
+    let kept = ActionLimits::default().kept;
     executor.handle_timeout(3 + kept);
     executor.ended(3 + kept, number + 1, Ok(None));
     outputs(&mut executor);
@@ -233,7 +233,7 @@ fn a_cancel_a_deadline_and_a_dead_client_stop_a_goal() {
 
 #[test]
 fn an_orphan_goes_on_if_the_action_says_so() {
-    let mut executor = Executor::new(Limits::default());
+    let mut executor = Executor::new(ActionLimits::default());
     let options = OfferOptions {
         orphans: Orphans::Continue,
         ..OfferOptions::default()
@@ -278,7 +278,7 @@ fn a_fence_is_checked_on_arrival_and_after_a_wait() {
     use std::sync::atomic::{AtomicBool, Ordering};
     let valid = Arc::new(AtomicBool::new(true));
     let gate = Arc::clone(&valid);
-    let mut executor = Executor::new(Limits::default());
+    let mut executor = Executor::new(ActionLimits::default());
     let mut description = action("drive", Policy::Queue(5));
     description.fenced = true;
     let options = OfferOptions {
@@ -372,7 +372,7 @@ fn a_withdrawn_action_ends_its_goals_and_can_be_offered_again() {
 
 #[test]
 fn descriptions_that_cannot_be_met_are_not_offered() {
-    let mut executor = Executor::new(Limits::default());
+    let mut executor = Executor::new(ActionLimits::default());
     let mut reserved = ActionDescription::new("drive");
     reserved
         .parameters
@@ -388,9 +388,9 @@ fn descriptions_that_cannot_be_met_are_not_offered() {
 
 #[test]
 fn a_client_that_repeats_its_goals_takes_no_more_conversations_than_goals() {
-    let limits = Limits {
+    let limits = ActionLimits {
         goals_of_client: 5,
-        ..Limits::default()
+        ..ActionLimits::default()
     };
     let mut executor = Executor::new(limits);
     let options = OfferOptions {
@@ -418,13 +418,13 @@ fn a_client_that_repeats_its_goals_takes_no_more_conversations_than_goals() {
 /// of another client.
 #[test]
 fn hostile_goals_take_bounded_memory() {
-    let limits = Limits {
+    let limits = ActionLimits {
         goals: 40,
         goals_of_client: 10,
         ended: 60,
         ended_of_client: 12,
         bytes_of_client: 20_000,
-        ..Limits::default()
+        ..ActionLimits::default()
     };
     for seed in 0..4 {
         let mut random = fastrand::Rng::with_seed(seed);

@@ -4,8 +4,8 @@
 
 use fipa_acl::AgentId;
 use fipa_actions::{
-    ActionDescription, Answer, Ask, Executor, Failure, Goal, GoalState, Json, Language, Limits,
-    OfferOptions, ParameterDescription, Policy, Progress, Refusal, Sl, Type, language,
+    ActionAnswer, ActionDescription, ActionLimits, Ask, Executor, Failure, Goal, GoalState, Json,
+    Language, OfferOptions, ParameterDescription, Policy, Progress, Refusal, Sl, Type, language,
 };
 use fipa_content::Term;
 
@@ -96,7 +96,7 @@ fn descriptions() -> Vec<ActionDescription> {
 
 /// Returns the status of a goal with everything, and of one without.
 fn status() -> Vec<fipa_actions::GoalStatus> {
-    let mut executor = Executor::new(Limits::default());
+    let mut executor = Executor::new(ActionLimits::default());
     let mut drive = ActionDescription::new("drive");
     drive.policy = Policy::Queue(3);
     executor.offer(drive, OfferOptions::default()).unwrap();
@@ -145,25 +145,29 @@ fn messages_to_robots_survive_both_languages() {
 fn answers_survive_both_languages() {
     let to = Ask::Goal(goal("(dock :goal a)"));
     for language in LANGUAGES {
-        let write = |to: &Ask, answer: &Answer| language.write_answer(&crex(), to, answer).unwrap();
+        let write =
+            |to: &Ask, answer: &ActionAnswer| language.write_answer(&crex(), to, answer).unwrap();
         let value = Term::parse("(docked :at (sequence 1 2) :charge 0.5)")
             .unwrap()
             .into_owned();
         for answer in [
-            Answer::Agreed { queued: true },
-            Answer::Agreed { queued: false },
-            Answer::Done(None),
-            Answer::Done(Some(value)),
-            Answer::Done(Some(Term::from("words here"))),
+            ActionAnswer::Agreed { queued: true },
+            ActionAnswer::Agreed { queued: false },
+            ActionAnswer::Done(None),
+            ActionAnswer::Done(Some(value)),
+            ActionAnswer::Done(Some(Term::from("words here"))),
         ] {
             let text = write(&to, &answer);
             assert_eq!(language.read_answer(&to, &text).unwrap(), answer);
         }
         for (to, answer) in [
-            (Ask::Actions, Answer::Actions(descriptions())),
-            (Ask::Actions, Answer::Actions(Vec::new())),
-            (Ask::Status, Answer::Status(status())),
-            (Ask::StatusOf("a".to_owned()), Answer::Status(Vec::new())),
+            (Ask::Actions, ActionAnswer::Actions(descriptions())),
+            (Ask::Actions, ActionAnswer::Actions(Vec::new())),
+            (Ask::Status, ActionAnswer::Status(status())),
+            (
+                Ask::StatusOf("a".to_owned()),
+                ActionAnswer::Status(Vec::new()),
+            ),
         ] {
             let text = write(&to, &answer);
             let read = language.read_answer(&to, &text);
@@ -171,9 +175,14 @@ fn answers_survive_both_languages() {
             let read = read.unwrap_or_else(|error| panic!("{shown}: {error}"));
             assert_eq!(read, answer, "{shown}");
         }
-        for (is_refusal, answer) in (refusals().into_iter().map(|it| (true, Answer::Refused(it))))
-            .chain(failures().into_iter().map(|it| (false, Answer::Failed(it))))
-        {
+        for (is_refusal, answer) in (refusals()
+            .into_iter()
+            .map(|it| (true, ActionAnswer::Refused(it))))
+        .chain(
+            failures()
+                .into_iter()
+                .map(|it| (false, ActionAnswer::Failed(it))),
+        ) {
             let text = write(&to, &answer);
             let read = language.read_rejection(is_refusal, &text).unwrap();
             assert_eq!(read, answer);
@@ -184,22 +193,22 @@ fn answers_survive_both_languages() {
 #[test]
 fn the_examples_of_the_book_are_what_is_written() {
     let to = Ask::Goal(goal("(dock :target (pose :x 1.5 :y 0.2) :goal c1-7)"));
-    let sl = |answer: Answer| {
+    let sl = |answer: ActionAnswer| {
         let text = Sl.write_answer(&crex(), &to, &answer).unwrap();
         String::from_utf8(text).unwrap()
     };
     let robot = "(agent-identifier :name crex)";
     assert_eq!(
-        sl(Answer::Agreed { queued: false }),
+        sl(ActionAnswer::Agreed { queued: false }),
         format!("((action {robot} (dock :goal c1-7)) executing)")
     );
     assert_eq!(
-        sl(Answer::Done(None)),
+        sl(ActionAnswer::Done(None)),
         format!("((done (action {robot} (dock :goal c1-7))))")
     );
     let refusal = Refusal::OutOfRange("speed".into(), "0 to 0.5".into(), "0.6".into());
     assert_eq!(
-        sl(Answer::Refused(refusal)),
+        sl(ActionAnswer::Refused(refusal)),
         format!("((action {robot} (dock :goal c1-7)) (out-of-range speed \"0 to 0.5\" \"0.6\"))")
     );
     let query = Sl.write_ask(&crex(), &Ask::Actions).unwrap();

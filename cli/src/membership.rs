@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use clap::Args;
 use fipa::admin::contact;
-use fipa::admin::routes::{self, AskError, Report};
+use fipa::admin::routes::{self, AskError, RouteReport};
 use fipa::threads::ThreadError;
 use fipa::{
     Agent, AgentId, Config, Domain, DomainDirError, Entry, ErrorChain, Incarnation, ListenError,
@@ -390,7 +390,7 @@ const REPORT_TIMEOUT: Duration = Duration::from_secs(5);
 pub(crate) async fn gateway_report(
     domain: &Domain,
     receivers: Option<&str>,
-) -> Result<Option<Report>, Failure> {
+) -> Result<Option<RouteReport>, Failure> {
     let Some(gateway) = gateway(domain) else {
         return Ok(None);
     };

@@ -9,7 +9,7 @@ use std::collections::{HashMap, HashSet};
 
 use fipa_acl::AgentId;
 use fipa_actions::{
-    ActionDescription, Ask, Executor, Failure, Goal, Json, Language, Limits, OfferOptions, Orphans,
+    ActionDescription, Ask, Executor, Failure, Goal, Json, Language, ActionLimits, OfferOptions, Orphans,
     Output, ParameterDescription, Policy, Progress, Sl,
 };
 use fipa_content::Term;
@@ -73,13 +73,13 @@ fn content(input: &mut Input<'_>, language: &dyn Language) -> Vec<u8> {
 /// Runs an executor with the goals and events that the bytes encode.
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
-    let limits = Limits {
+    let limits = ActionLimits {
         goals: 12,
         goals_of_client: 6,
         ended: 12,
         ended_of_client: 4,
         bytes_of_client: 2_000,
-        ..Limits::default()
+        ..ActionLimits::default()
     };
     let mut executor = Executor::new(limits.clone());
     for (description, options) in offered() {

@@ -25,12 +25,12 @@ use std::fmt::Debug;
 use bytes::Bytes;
 use fipa_acl::json::{Document, document_from_json, envelope_to_json, message_to_json};
 use fipa_acl::{
-    AgentId, AgentIdView, DecodeError, LockDialect, Envelope, EnvelopeView, Message, MessageIndex,
+    AgentId, AgentIdView, DecodeError, Dialect, Envelope, EnvelopeView, Message, MessageIndex,
     MessageView, Payload, Representation,
 };
 use serde_json::json;
 
-const DIALECTS: [LockDialect; 3] = [LockDialect::Standard, LockDialect::FipaServices, LockDialect::Jade];
+const DIALECTS: [Dialect; 3] = [Dialect::Standard, Dialect::FipaServices, Dialect::Jade];
 
 /// Checks that a decoded message is the same after a round trip in every encoding and dialect that can
 /// represent it, and in JSON.
@@ -84,7 +84,7 @@ pub fn envelope_survives(envelope: &Envelope) {
                 panic!("{representation} for {dialect} cannot be read: {error}")
             });
             assert_eq!(len, written.len());
-            if representation == Representation::Xml && dialect == LockDialect::Jade {
+            if representation == Representation::Xml && dialect == Dialect::Jade {
                 // JADE reads only one part of an envelope.
                 assert_eq!(again.base, envelope.effective());
             } else {
@@ -95,8 +95,8 @@ pub fn envelope_survives(envelope: &Envelope) {
 }
 
 /// Checks that both values are the same. The dialect of fipa_services has times without a zone.
-fn same<T: Debug + PartialEq>(one: &T, other: &T, dialect: LockDialect) {
-    if dialect == LockDialect::FipaServices {
+fn same<T: Debug + PartialEq>(one: &T, other: &T, dialect: Dialect) {
+    if dialect == Dialect::FipaServices {
         let local = |what: &T| format!("{what:?}").replace("zone: Utc", "zone: Unspecified");
         assert_eq!(local(one), local(other));
     } else {

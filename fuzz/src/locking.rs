@@ -6,7 +6,7 @@
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_locking::{
-    Act, Action, Algorithm, AnyAlgorithm, Content, Event, Fence, Locks, Options, OwnerState, Peer,
+    Act, Action, Algorithm, AnyAlgorithm, Content, Event, Fence, Locks, Options, OwnerState, LockPeer,
     Resource, codec,
 };
 
@@ -18,9 +18,9 @@ fn id(name: &str) -> AgentId {
     AgentId::new(name).expect("a name")
 }
 
-fn peer(input: &mut Input<'_>) -> Peer {
+fn peer(input: &mut Input<'_>) -> LockPeer {
     let name = input.one_of(&NAMES);
-    Peer::new(name, u64::from(input.byte() % 2)).expect("a name")
+    LockPeer::new(name, u64::from(input.byte() % 2)).expect("a name")
 }
 
 fn bay() -> Resource {
@@ -69,7 +69,7 @@ fn content(input: &mut Input<'_>, act: &Performative, kind: Algorithm) -> Vec<u8
     content
 }
 
-fn message(input: &mut Input<'_>, kind: Algorithm, from: &Peer) -> Option<Message> {
+fn message(input: &mut Input<'_>, kind: Algorithm, from: &LockPeer) -> Option<Message> {
     let act = input.one_of(&[
         Performative::Request,
         Performative::Agree,
@@ -108,7 +108,7 @@ fn message(input: &mut Input<'_>, kind: Algorithm, from: &Peer) -> Option<Messag
 pub fn play(bytes: &[u8]) {
     let mut input = Input(bytes);
     let kind = input.one_of(&Algorithm::ALL);
-    let me = Peer::new("crane", 7).expect("a name");
+    let me = LockPeer::new("crane", 7).expect("a name");
     let mut locks: Locks<AnyAlgorithm> = Locks::new(me, kind, Options::default());
     let (mut now, mut out) = (0, Vec::new());
     let state = OwnerState::first().next_life(Options::default().lease);

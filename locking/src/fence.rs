@@ -4,7 +4,7 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use crate::{NameError, Peer, Resource};
+use crate::{LockPeer, NameError, Resource};
 
 /// A fence: the number of a grant. The fences of a resource strictly rise, also over the restarts of its
 /// owner (see [`OwnerState`](crate::OwnerState)). A fence says nothing to another owner, and nothing about
@@ -27,7 +27,7 @@ pub struct Fence {
 
 impl Fence {
     pub(crate) fn new(
-        owner: &Peer,
+        owner: &LockPeer,
         resource: &Resource,
         (epoch, number): (u64, u64),
         run: u64,
@@ -128,7 +128,7 @@ impl FromStr for Fence {
             return Err(FenceError::Form);
         }
         let run = u64::from_str_radix(run, 16).map_err(|_| FenceError::Form)?;
-        let owner = Peer::new(&owner.replace("%23", "#").replace("%25", "%"), 0)?;
+        let owner = LockPeer::new(&owner.replace("%23", "#").replace("%25", "%"), 0)?;
         let resource = Resource::new(resource)?;
         let position = (digits(epoch)?, digits(number)?);
         Ok(Self::new(&owner, &resource, position, run))
@@ -248,7 +248,7 @@ mod tests {
             ),
             ("a#b%23", "#c%", "7.42.5a31c0e4d2b19f07@a%23b%2523##c%"),
         ] {
-            let owner = Peer::new(owner, 1).unwrap();
+            let owner = LockPeer::new(owner, 1).unwrap();
             let resource = Resource::new(resource).unwrap();
             let run = u64::from_str_radix(RUN, 16).unwrap();
             let fence = Fence::new(&owner, &resource, (7, 42), run);

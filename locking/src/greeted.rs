@@ -5,12 +5,12 @@
 
 use std::collections::BTreeSet;
 
-use crate::{Millis, Peer};
+use crate::{LockPeer, Millis};
 
 /// The agents whose answers the first request of an agent waits for.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
 pub(crate) struct Greeted {
-    peers: BTreeSet<Peer>,
+    peers: BTreeSet<LockPeer>,
     /// End of the wait.
     until: Option<Millis>,
     is_over: bool,
@@ -18,7 +18,7 @@ pub(crate) struct Greeted {
 
 impl Greeted {
     /// Adds an agent. The wait ends `within` after the first one.
-    pub(crate) fn expect(&mut self, now: Millis, within: Millis, peer: &Peer) {
+    pub(crate) fn expect(&mut self, now: Millis, within: Millis, peer: &LockPeer) {
         if !self.is_over {
             self.until.get_or_insert(now.saturating_add(within));
             self.peers.insert(peer.clone());
@@ -26,7 +26,7 @@ impl Greeted {
     }
 
     /// Handles an agent that has answered or has left. Returns whether it ends the wait.
-    pub(crate) fn no_longer_expect(&mut self, peer: &Peer) -> bool {
+    pub(crate) fn no_longer_expect(&mut self, peer: &LockPeer) -> bool {
         self.peers.remove(peer) && self.peers.is_empty()
     }
 

@@ -18,8 +18,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::{
-    Act, Action, ClaimId, Content, Conversation, Ending, Event, Fence, LockMessage, Locks, Millis,
-    MutualExclusion, Peer, Resource,
+    Act, Action, ClaimId, Content, Conversation, Ending, Event, Fence, LockMessage, LockPeer,
+    Locks, Millis, MutualExclusion, Resource,
 };
 
 /// A broken invariant.
@@ -40,7 +40,7 @@ pub struct Violation {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct History {
     resource: Resource,
-    owner: Peer,
+    owner: LockPeer,
     highest: (u64, u64),
     /// Highest fence that an agent has held.
     seen: (u64, u64),
@@ -48,14 +48,14 @@ pub struct History {
     fences: BTreeSet<Fence>,
     live: Option<Live>,
     /// Reports that were received and neither granted nor released.
-    confirmed: BTreeSet<(Peer, Conversation)>,
+    confirmed: BTreeSet<(LockPeer, Conversation)>,
     /// Latest conversation that each agent released.
-    released: BTreeMap<Peer, Conversation>,
+    released: BTreeMap<LockPeer, Conversation>,
     /// The message that the owner handles.
-    handled: Option<(Peer, LockMessage)>,
-    held: BTreeMap<Peer, Fence>,
+    handled: Option<(LockPeer, LockMessage)>,
+    held: BTreeMap<LockPeer, Fence>,
     /// Agents that hold the resource without a fence.
-    inside: BTreeSet<Peer>,
+    inside: BTreeSet<LockPeer>,
     /// Highest fence that an agent held and holds no more.
     left: (u64, u64),
     /// Whether the owner has forgotten a life.
@@ -65,7 +65,7 @@ pub struct History {
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Live {
-    holder: Peer,
+    holder: LockPeer,
     conversation: Conversation,
     fence: Option<Fence>,
 }
@@ -73,7 +73,7 @@ struct Live {
 impl History {
     /// Creates the empty history of a resource and its owner.
     #[must_use]
-    pub fn new(resource: Resource, owner: Peer) -> Self {
+    pub fn new(resource: Resource, owner: LockPeer) -> Self {
         Self {
             resource,
             owner,
@@ -99,7 +99,7 @@ impl History {
     }
 
     /// Records a restart of the owner, with another registration.
-    pub fn owner_restarted(&mut self, owner: Peer) {
+    pub fn owner_restarted(&mut self, owner: LockPeer) {
         self.owner = owner;
         self.live = None;
         self.confirmed.clear();
@@ -122,13 +122,13 @@ impl History {
 
     /// Records that a registration of an agent has ended, so that its conversations do not count any
     /// more.
-    pub fn departed(&mut self, peer: &Peer) {
+    pub fn departed(&mut self, peer: &LockPeer) {
         self.confirmed.retain(|(from, _)| from != peer);
         self.released.remove(peer);
     }
 
     /// Records a message that the owner is about to handle.
-    pub fn owner_receives(&mut self, from: &Peer, message: &LockMessage) {
+    pub fn owner_receives(&mut self, from: &LockPeer, message: &LockMessage) {
         let Content::Lock { resource, act } = &message.content else {
             return;
         };
@@ -229,7 +229,7 @@ impl History {
         }
     }
 
-    fn sent(&mut self, to: &Peer, message: &LockMessage) {
+    fn sent(&mut self, to: &LockPeer, message: &LockMessage) {
         let Content::Lock { resource, act } = &message.content else {
             return;
         };
@@ -253,7 +253,7 @@ impl History {
 
     /// Records whether an agent holds the resource, according to the agent itself. An agent that
     /// crashed holds nothing.
-    pub fn holds(&mut self, agent: &Peer, fence: Option<&Fence>) {
+    pub fn holds(&mut self, agent: &LockPeer, fence: Option<&Fence>) {
         let Some(fence) = fence else {
             if let Some(left) = self.held.remove(agent) {
                 self.left = self.left.max(left.position());
@@ -289,7 +289,7 @@ impl History {
     }
 
     /// Records whether an agent holds the resource of an owner that gives no fences.
-    pub fn holds_unfenced(&mut self, agent: &Peer, holds: bool) {
+    pub fn holds_unfenced(&mut self, agent: &LockPeer, holds: bool) {
         if !holds {
             self.inside.remove(agent);
         } else if self.inside.insert(agent.clone()) && self.inside.len() > 1 {
@@ -314,41 +314,41 @@ impl History {
 /// The grants of one resource that precede open requests.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
 pub struct Turns {
-    open: BTreeMap<Peer, Open>,
+    open: BTreeMap<LockPeer, Open>,
     highest: u64,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Open {
     /// Members that have not received the request.
-    unreached: BTreeSet<Peer>,
+    unreached: BTreeSet<LockPeer>,
     /// Grants of the other agents, by name, since the request has reached all members.
     grants: BTreeMap<String, u64>,
 }
 
 impl Turns {
     /// Records a request, and the members that it has to reach.
-    pub fn requested(&mut self, by: &Peer, unreached: BTreeSet<Peer>) {
+    pub fn requested(&mut self, by: &LockPeer, unreached: BTreeSet<LockPeer>) {
         let grants = BTreeMap::new();
         self.open.insert(by.clone(), Open { unreached, grants });
     }
 
     /// Records that a request has reached a member.
-    pub fn reached(&mut self, by: &Peer, member: &Peer) {
+    pub fn reached(&mut self, by: &LockPeer, member: &LockPeer) {
         if let Some(open) = self.open.get_mut(by) {
             open.unreached.remove(member);
         }
     }
 
     /// Records that a request has reached its only receiver.
-    pub fn reached_all(&mut self, by: &Peer) {
+    pub fn reached_all(&mut self, by: &LockPeer) {
         if let Some(open) = self.open.get_mut(by) {
             open.unreached.clear();
         }
     }
 
     /// Records a grant.
-    pub fn granted(&mut self, to: &Peer) {
+    pub fn granted(&mut self, to: &LockPeer) {
         self.open.remove(to);
         let reached = self.open.values_mut();
         for open in reached.filter(|open| open.unreached.is_empty()) {
@@ -359,7 +359,7 @@ impl Turns {
     }
 
     /// Records the end of a request without a grant.
-    pub fn ended(&mut self, by: &Peer) {
+    pub fn ended(&mut self, by: &LockPeer) {
         self.open.remove(by);
     }
 
@@ -371,7 +371,7 @@ impl Turns {
     }
 
     /// Records that a registration has ended.
-    pub fn departed(&mut self, peer: &Peer) {
+    pub fn departed(&mut self, peer: &LockPeer) {
         self.open.remove(peer);
         for open in self.open.values_mut() {
             open.unreached.remove(peer);

@@ -26,12 +26,12 @@
 //! (`CLOCK_BOOTTIME`). Rates of two clocks may differ by up to 2 %.
 //!
 //! ```
-//! use fipa_locking::{Action, AnyAlgorithm, Algorithm, Event, Locks, Options, Peer, OwnerState, Resource};
+//! use fipa_locking::{Action, AnyAlgorithm, Algorithm, Event, Locks, Options, LockPeer, OwnerState, Resource};
 //!
 //! let bay = Resource::new("bay")?;
 //! let options = Options::default();
 //! let mut crane: Locks<AnyAlgorithm> =
-//!     Locks::new(Peer::new("crane", 1)?, Algorithm::OwnerQueue, options);
+//!     Locks::new(LockPeer::new("crane", 1)?, Algorithm::OwnerQueue, options);
 //! let mut actions = Vec::new();
 //! // The state has to be written and synced before `own` is called.
 //! let state = OwnerState::first().next_life(options.lease);
@@ -77,7 +77,7 @@ pub use fence::{Admission, Fence, FenceError, NotAdmitted};
 pub use holder::{Holder, HolderStep};
 pub use locks::{Action, ClaimId, Event, Failure, LockStatus, Locks};
 pub use message::{Act, Content, LockDialect, LockMessage, Refusal, Token};
-pub use names::{Conversation, MAX_NAME, Millis, NameError, Peer, Resource};
+pub use names::{Conversation, LockPeer, MAX_NAME, Millis, NameError, Resource};
 pub use options::{Options, OptionsError};
 pub use owner::{Ending, Grant, Owner, OwnerStep};
 pub use queue::MAX_PLACE;

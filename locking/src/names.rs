@@ -71,12 +71,12 @@ impl fmt::Debug for Resource {
 
 /// An agent in one registration. An agent that restarts has another registration.
 #[derive(Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct Peer {
+pub struct LockPeer {
     name: Arc<str>,
     registration: u64,
 }
 
-impl Peer {
+impl LockPeer {
     /// Checks the name of an agent. `registration` differs for each registration of the name.
     ///
     /// # Errors
@@ -105,13 +105,13 @@ impl Peer {
     }
 }
 
-impl fmt::Display for Peer {
+impl fmt::Display for LockPeer {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.name)
     }
 }
 
-impl fmt::Debug for Peer {
+impl fmt::Debug for LockPeer {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}#{}", self.name, self.registration)
     }
@@ -152,7 +152,7 @@ impl Conversation {
 
     /// Whether the identifier has the form that `peer` gives the conversations that it begins.
     #[must_use]
-    pub fn is_of(&self, peer: &Peer) -> bool {
+    pub fn is_of(&self, peer: &LockPeer) -> bool {
         *self.prefix == *peer.name && self.number.is_some()
     }
 
@@ -192,7 +192,7 @@ mod tests {
         );
         assert_eq!(Resource::new("a\nb"), Err(NameError::Control(1)));
         assert!(Resource::new("docking interface 3").is_ok());
-        assert_eq!(Peer::new("", 1), Err(NameError::Empty));
+        assert_eq!(LockPeer::new("", 1), Err(NameError::Empty));
     }
 
     #[test]

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 
 use crate::faults::{Fault, fault};
 use crate::queue::Queue;
-use crate::{Act, Conversation, Fence, Gate, Millis, OwnerState, Peer, Refusal, Resource};
+use crate::{Act, Conversation, Fence, Gate, LockPeer, Millis, OwnerState, Refusal, Resource};
 
 /// Highest epoch that a report can have. The clock reaches it in nine million years, and the epochs above
 /// are left to the restarts that follow a false report.
@@ -23,7 +23,7 @@ const MAX_REPORTED: u64 = 1 << 48;
 /// The owner's state for one resource.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Owner {
-    me: Peer,
+    me: LockPeer,
     resource: Resource,
     epoch: u64,
     /// Random bits of this life.
@@ -43,11 +43,11 @@ pub struct Owner {
     silent_until: Option<Millis>,
     live: Option<Grant>,
     /// Holder whose grant expired, until it reports or ends.
-    unproved: Option<(Peer, Conversation)>,
+    unproved: Option<(LockPeer, Conversation)>,
     /// At most one report per registration.
     queue: Queue,
     /// Latest conversation of each agent that has ended.
-    closed: BTreeMap<Peer, Conversation>,
+    closed: BTreeMap<LockPeer, Conversation>,
     fault: Fault,
 }
 
@@ -55,7 +55,7 @@ pub struct Owner {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Grant {
     /// The holder.
-    pub holder: Peer,
+    pub holder: LockPeer,
     /// The conversation of its request.
     pub conversation: Conversation,
     /// The fence. A legacy agent has none.
@@ -88,7 +88,7 @@ pub enum OwnerStep {
     /// Send a message.
     Send {
         /// The receiver.
-        to: Peer,
+        to: LockPeer,
         /// The conversation.
         conversation: Conversation,
         /// The act.
@@ -99,7 +99,7 @@ pub enum OwnerStep {
     /// Ask a member for a sign of life.
     Probe {
         /// The member.
-        to: Peer,
+        to: LockPeer,
         /// The time.
         at: Millis,
     },
@@ -117,7 +117,7 @@ pub enum OwnerStep {
 impl Owner {
     /// Creates the state of a life that is silent for the given time.
     pub(crate) fn new(
-        me: Peer,
+        me: LockPeer,
         resource: Resource,
         life: &OwnerState,
         lease: Millis,
@@ -166,7 +166,7 @@ impl Owner {
     }
 
     /// Agents whose reports wait, the next one first.
-    pub fn waiters(&self) -> impl Iterator<Item = &Peer> {
+    pub fn waiters(&self) -> impl Iterator<Item = &LockPeer> {
         self.queue.iter().map(|waiter| &waiter.peer)
     }
 
@@ -257,7 +257,7 @@ impl Owner {
     pub(crate) fn ask(
         &mut self,
         now: Millis,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         (asked, place): (Millis, Option<u32>),
         out: &mut Vec<OwnerStep>,
@@ -271,7 +271,7 @@ impl Owner {
     }
 
     /// Handles a sign of life of a member that was suspected.
-    pub(crate) fn heard(&mut self, now: Millis, peer: &Peer, out: &mut Vec<OwnerStep>) {
+    pub(crate) fn heard(&mut self, now: Millis, peer: &LockPeer, out: &mut Vec<OwnerStep>) {
         self.queue.heard(peer);
         self.handle_timeout(now, out);
     }
@@ -280,7 +280,7 @@ impl Owner {
     pub(crate) fn confirm(
         &mut self,
         now: Millis,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         asked: Option<Millis>,
         out: &mut Vec<OwnerStep>,
@@ -332,7 +332,7 @@ impl Owner {
     pub(crate) fn renew(
         &mut self,
         now: Millis,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         fence: &Fence,
         asked: Millis,
@@ -353,7 +353,7 @@ impl Owner {
     pub(crate) fn release(
         &mut self,
         now: Millis,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         out: &mut Vec<OwnerStep>,
     ) {
@@ -376,7 +376,7 @@ impl Owner {
     /// Records that a legacy agent has entered, for an algorithm in which it does not report that.
     pub(crate) fn entered_without_report(
         &mut self,
-        peer: &Peer,
+        peer: &LockPeer,
         conversation: &Conversation,
         out: &mut Vec<OwnerStep>,
     ) {
@@ -402,7 +402,13 @@ impl Owner {
     }
 
     /// Handles the loss of an agent. `gone` is a proof that its registration or its process has ended.
-    pub(crate) fn lost(&mut self, now: Millis, peer: &Peer, gone: bool, out: &mut Vec<OwnerStep>) {
+    pub(crate) fn lost(
+        &mut self,
+        now: Millis,
+        peer: &LockPeer,
+        gone: bool,
+        out: &mut Vec<OwnerStep>,
+    ) {
         self.queue.lost(peer, gone);
         if gone {
             if self.live.as_ref().is_some_and(|live| live.holder == *peer) {
@@ -443,13 +449,13 @@ impl Owner {
         self.grant_next(now, out);
     }
 
-    fn is_closed(&self, peer: &Peer, conversation: &Conversation) -> bool {
+    fn is_closed(&self, peer: &LockPeer, conversation: &Conversation) -> bool {
         let closed = self.closed.get(peer);
         !fault!(self.fault, GrantWithdrawn)
             && closed.is_some_and(|closed| conversation.is_not_after(closed))
     }
 
-    fn close(&mut self, peer: &Peer, conversation: &Conversation) {
+    fn close(&mut self, peer: &LockPeer, conversation: &Conversation) {
         let closed = self.closed.get(peer);
         if !closed.is_some_and(|closed| conversation.is_not_after(closed)) {
             self.closed.insert(peer.clone(), conversation.clone());
@@ -457,7 +463,7 @@ impl Owner {
     }
 
     /// The agent shows that it has left the conversation whose grant expired.
-    fn proved(&mut self, from: &Peer, conversation: &Conversation) {
+    fn proved(&mut self, from: &LockPeer, conversation: &Conversation) {
         let unproved = self.unproved.as_ref();
         if unproved.is_some_and(|(peer, of)| peer == from && of.is_not_after(conversation)) {
             self.unproved = None;
@@ -526,7 +532,7 @@ impl Owner {
     }
 
     fn granted(
-        to: &Peer,
+        to: &LockPeer,
         conversation: &Conversation,
         fence: Fence,
         lease: Millis,
@@ -544,7 +550,7 @@ impl Owner {
     }
 
     fn refused(
-        to: &Peer,
+        to: &LockPeer,
         conversation: &Conversation,
         reason: Refusal,
         asked: Millis,

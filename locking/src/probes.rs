@@ -4,14 +4,14 @@
 
 use std::collections::BTreeMap;
 
-use crate::{Millis, Options, Peer};
+use crate::{LockPeer, Millis, Options};
 
 /// Number of probes without an answer after which a peer is lost.
 const ATTEMPTS: u8 = 2;
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
 pub(crate) struct Probes {
-    peers: BTreeMap<Peer, Probed>,
+    peers: BTreeMap<LockPeer, Probed>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -26,12 +26,12 @@ struct Probed {
 /// Result of a timeout.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum ProbeStep {
-    Send(Peer),
-    Lost(Peer),
+    Send(LockPeer),
+    Lost(LockPeer),
 }
 
 impl Probes {
-    pub(crate) fn depend(&mut self, now: Millis, options: &Options, peer: &Peer) {
+    pub(crate) fn depend(&mut self, now: Millis, options: &Options, peer: &LockPeer) {
         let probed = self.peers.entry(peer.clone()).or_insert(Probed {
             dependents: 0,
             next: now.saturating_add(options.probe_interval),
@@ -40,7 +40,7 @@ impl Probes {
         probed.dependents += 1;
     }
 
-    pub(crate) fn no_longer_depend(&mut self, peer: &Peer) {
+    pub(crate) fn no_longer_depend(&mut self, peer: &LockPeer) {
         if let Some(probed) = self.peers.get_mut(peer) {
             probed.dependents = probed.dependents.saturating_sub(1);
             if probed.dependents == 0 {
@@ -49,7 +49,7 @@ impl Probes {
         }
     }
 
-    pub(crate) fn heard(&mut self, now: Millis, options: &Options, peer: &Peer) {
+    pub(crate) fn heard(&mut self, now: Millis, options: &Options, peer: &LockPeer) {
         if let Some(probed) = self.peers.get_mut(peer) {
             probed.sent = 0;
             probed.next = now.saturating_add(options.probe_interval);

@@ -5,7 +5,7 @@
 
 use fipa_locking::{
     Act, Action, Algorithm, AnyAlgorithm, Content, Conversation, Event, Fence, LockDialect,
-    LockMessage, Locks, Millis, Options, OwnerState, Peer, Resource,
+    LockMessage, LockPeer, Locks, Millis, Options, OwnerState, Resource,
 };
 
 const LEASE: Millis = 15_000;
@@ -14,8 +14,8 @@ fn bay() -> Resource {
     Resource::new("bay").unwrap()
 }
 
-fn peer(name: &str, registration: u64) -> Peer {
-    Peer::new(name, registration).unwrap()
+fn peer(name: &str, registration: u64) -> LockPeer {
+    LockPeer::new(name, registration).unwrap()
 }
 
 fn fence(text: &str) -> Fence {
@@ -64,7 +64,7 @@ impl Agent {
         self.now = end;
     }
 
-    fn receive(&mut self, from: &Peer, conversation: &str, act: Act) {
+    fn receive(&mut self, from: &LockPeer, conversation: &str, act: Act) {
         let message = LockMessage {
             conversation: Conversation::parse(conversation),
             dialect: LockDialect::Own,

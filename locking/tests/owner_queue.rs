@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use fipa_locking::{
     Act, Action, Algorithm, AnyAlgorithm, ClaimId, Content, Conversation, Event, Failure, Fence,
-    LockDialect, LockMessage, Locks, Millis, Options, OwnerState, Peer, Refusal, Resource,
+    LockDialect, LockMessage, LockPeer, Locks, Millis, Options, OwnerState, Refusal, Resource,
 };
 
 const OWN: LockDialect = LockDialect::Own;
@@ -16,7 +16,7 @@ fn bay() -> Resource {
     Resource::new("bay").unwrap()
 }
 
-type Letter = (Peer, Peer, LockMessage);
+type Letter = (LockPeer, LockPeer, LockMessage);
 
 /// Agents with one clock, whose letters arrive at once and in order.
 #[derive(Default)]
@@ -57,12 +57,12 @@ impl Net {
 
     fn start(&mut self, name: &str, registration: u64, kind: Algorithm, mut options: Options) {
         options.first_conversation = registration * 1_000;
-        let me = Peer::new(name, registration).unwrap();
+        let me = LockPeer::new(name, registration).unwrap();
         self.agents
             .insert(name.to_owned(), Locks::new(me.clone(), kind, options));
         for other in self.agents.keys().cloned().collect::<Vec<_>>() {
             let peer = self.agents[&other].me().clone();
-            let join = |locks: &mut Locks<_>, now, peer: &Peer, out: &mut Vec<_>| {
+            let join = |locks: &mut Locks<_>, now, peer: &LockPeer, out: &mut Vec<_>| {
                 locks.join(now, peer, OWN, out);
             };
             self.call(name, |locks, now, out| join(locks, now, &peer, out));
@@ -169,7 +169,7 @@ impl Net {
         self.deliver();
     }
 
-    fn depart(&mut self, from: &str, gone: &Peer) {
+    fn depart(&mut self, from: &str, gone: &LockPeer) {
         self.call(from, |locks, now, out| locks.depart(now, gone, out));
         self.deliver();
     }
@@ -285,7 +285,7 @@ fn a_request_to_a_queue_does_not_wait_for_answers_to_greetings() {
         net.own("crane", OwnerState::first().next_life(LEASE));
         net.run(1_000);
         net.start("a", 1, Algorithm::default(), Options::default());
-        let silent = Peer::new("silent", 1).unwrap();
+        let silent = LockPeer::new("silent", 1).unwrap();
         let claim = net.call("a", |locks, now, out| {
             locks.expect(now, &silent);
             locks.lock(now, &bay(), None, out)
@@ -725,7 +725,7 @@ fn an_owner_refuses_requests_of_other_algorithms_and_reports_them() {
                 net.own("crane", OwnerState::first().next_life(LEASE));
                 net.run(1_000);
                 net.clear();
-                let stranger = Peer::new("stranger", 1).unwrap();
+                let stranger = LockPeer::new("stranger", 1).unwrap();
                 let request = letter(kind, "stranger_1", dialect, act);
                 net.call("crane", |locks, now, out| {
                     locks.handle(now, &stranger, &request, out);
@@ -783,7 +783,7 @@ fn a_refused_request_is_made_again_with_the_algorithm_of_the_refusal() {
         net.agents.insert(
             "a".to_owned(),
             Locks::new(
-                Peer::new("a", 1).unwrap(),
+                LockPeer::new("a", 1).unwrap(),
                 Algorithm::default(),
                 Options::default(),
             ),
@@ -826,7 +826,7 @@ fn the_owner_of_a_resource_for_legacy_agents_uses_an_algorithm_of_theirs() {
         net.start("crane", 1, kind, options);
         net.own("crane", OwnerState::first().next_life(LEASE));
         net.run(1_000);
-        let member = Peer::new("a", 1).unwrap();
+        let member = LockPeer::new("a", 1).unwrap();
         net.call("crane", |locks, now, out| {
             locks.join(now, &member, OWN, out)
         });
@@ -845,7 +845,7 @@ fn at_an_owner_of_the_cpp_library_the_configured_algorithm_of_the_paper_is_used(
         options.legacy_algorithm = legacy_algorithm;
         let mut net = Net::default();
         net.start("a", 1, Algorithm::OwnerQueue, options);
-        let owner = Peer::new("agent1", 0).unwrap();
+        let owner = LockPeer::new("agent1", 0).unwrap();
         net.call("a", |locks, now, out| {
             locks.join(now, &owner, LockDialect::Legacy, out);
             locks.lock(now, &bay(), None, out)
@@ -870,7 +870,7 @@ fn at_an_owner_of_the_cpp_library_the_configured_algorithm_of_the_paper_is_used(
 #[test]
 fn a_member_agrees_to_requests_of_an_algorithm_that_it_does_not_use() {
     let ra = Algorithm::RicartAgrawalaExtended;
-    let asker = Peer::new("b", 1).unwrap();
+    let asker = LockPeer::new("b", 1).unwrap();
     let request = letter(ra, "b_1", OWN, Act::Request { clock: 4 });
     // It was told to use another one, it knows an owner with another one, or it is looking for the owner.
     for (kind, owner) in [
@@ -880,7 +880,7 @@ fn a_member_agrees_to_requests_of_an_algorithm_that_it_does_not_use() {
     ] {
         let mut net = Net::default();
         net.start("a", 1, kind, Options::default());
-        let crane = Peer::new("crane", 1).unwrap();
+        let crane = LockPeer::new("crane", 1).unwrap();
         net.call("a", |locks, now, out| {
             if let Some(named) = owner {
                 locks.owner_named(now, &bay(), &crane, OWN, Some(named), out);

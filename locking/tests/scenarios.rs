@@ -4,16 +4,16 @@
 
 use fipa_locking::{
     Act, Action, Algorithm, AnyAlgorithm, ClaimId, Content, Conversation, Ending, Event, Failure,
-    Fence, LockDialect, LockMessage, Locks, Millis, Options, OwnerState, Peer, Refusal, Resource,
-    Token,
+    Fence, LockDialect, LockMessage, LockPeer, Locks, Millis, Options, OwnerState, Refusal,
+    Resource, Token,
 };
 
 fn bay() -> Resource {
     Resource::new("bay").unwrap()
 }
 
-fn peer(name: &str) -> Peer {
-    Peer::new(name, 1).unwrap()
+fn peer(name: &str) -> LockPeer {
+    LockPeer::new(name, 1).unwrap()
 }
 
 /// One agent, its time, and the actions that it has made since the last look.

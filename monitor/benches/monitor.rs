@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use fipa_acl::{Message, Performative};
-use fipa_monitor::{Header, Library, Limits, Monitor};
+use fipa_monitor::{Header, Library, Monitor, MonitorLimits};
 
 use self::conversations::{answer, id, message, now, with_open};
 
@@ -100,7 +100,7 @@ fn verdicts(c: &mut Criterion) {
 
 fn memory(_: &mut Criterion) {
     const MANY: usize = 1_000_000;
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.conversations = MANY;
     limits.bytes = usize::MAX;
     let library = Arc::new(Library::standard());

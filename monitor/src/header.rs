@@ -103,7 +103,7 @@ impl<'a> Header<'a> {
 
     /// Sets the peer to which a conversation belongs that this message begins. Without it, this is the
     /// sender. A caller that knows the connection of the message names it here, so that the memory of
-    /// a peer with many agent names is bounded too: see [`Limits::bytes`](crate::Limits::bytes).
+    /// a peer with many agent names is bounded too: see [`MonitorLimits::bytes`](crate::MonitorLimits::bytes).
     #[must_use]
     pub fn peer(mut self, peer: impl Into<Cow<'a, str>>) -> Self {
         self.peer = Some(peer.into());

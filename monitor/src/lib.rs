@@ -12,10 +12,10 @@
 //! current time ([`Moment`]), and gets verdicts.
 //!
 //! A message that continues a conversation of which the monitor does not know the beginning is
-//! *unchecked*, and no violation. [`History`] tells the monitor how much it knows, and [`Policy`]
+//! *unchecked*, and no violation. [`History`] tells the monitor how much it knows, and [`MonitorPolicy`]
 //! refuses messages that no conversation shows to be wrong.
 //!
-//! Files and messages may be hostile: every size has a bound, and [`Limits`] bounds the memory.
+//! Files and messages may be hostile: every size has a bound, and [`MonitorLimits`] bounds the memory.
 
 mod act;
 mod change;
@@ -48,10 +48,10 @@ pub use act::near_standard;
 pub use clock::Moment;
 pub use header::Header;
 pub use library::{Library, LibraryError, LibraryFull};
-pub use limits::Limits;
+pub use limits::MonitorLimits;
 pub use machine::{After, Cancel, Machine, Scope, State, Subprotocol, Timeout, Transition};
 pub use monitor::{Event, Monitor};
-pub use policy::{History, Policy, one_edit_apart};
+pub use policy::{History, MonitorPolicy, one_edit_apart};
 pub use snapshot::SnapshotError;
 pub use verdict::{
     Accepted, Expected, ReplyMismatch, Unchecked, Verdict, Violation, ViolationKind,

@@ -5,7 +5,7 @@ use std::time::Duration;
 /// Bounds of the conversations that a monitor keeps: their number, their memory and their time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct Limits {
+pub struct MonitorLimits {
     /// Maximum number of conversations, including embedded ones. Beyond it, the monitor evicts the
     /// least recently active conversation that is over or, if there is none, the least recently
     /// active one. A peer has at most an eighth, or eight: beyond it, the monitor evicts conversations
@@ -26,7 +26,7 @@ pub struct Limits {
     pub idle: Duration,
 }
 
-impl Default for Limits {
+impl Default for MonitorLimits {
     /// Returns limits of 100,000 conversations, 64 MiB, 1,024 participants and 64 embedded
     /// conversations each, one minute after the end, and 24 hours without a message.
     fn default() -> Self {
@@ -41,7 +41,7 @@ impl Default for Limits {
     }
 }
 
-impl Limits {
+impl MonitorLimits {
     /// Maximum number of bytes of the conversations of a peer, and of a single conversation.
     pub(crate) fn share_of_bytes(&self) -> usize {
         self.bytes / SHARES

@@ -25,7 +25,7 @@ use crate::report::violation;
 use crate::roles::take_back_local;
 use crate::table::{List, Slot, Table};
 use crate::verdict::{Accepted, Unchecked, Verdict, ViolationKind as Kind};
-use crate::{Header, History, Library, Limits, Moment, Policy};
+use crate::{Header, History, Library, Moment, MonitorLimits, MonitorPolicy};
 
 /// Checks messages against the protocols of their conversations.
 ///
@@ -39,8 +39,8 @@ use crate::{Header, History, Library, Limits, Moment, Policy};
 #[derive(Debug)]
 pub struct Monitor {
     pub(crate) library: Arc<Library>,
-    pub(crate) limits: Limits,
-    policy: Policy,
+    pub(crate) limits: MonitorLimits,
+    policy: MonitorPolicy,
     history: History,
     /// The monitored agent; none for an observer.
     pub(crate) agent: Option<Arc<str>>,
@@ -77,7 +77,7 @@ pub enum Event {
         next: Option<String>,
     },
     /// The monitor has removed a conversation that was not over, because it had no message for
-    /// [`Limits::idle`].
+    /// [`MonitorLimits::idle`].
     Abandoned {
         /// Name of the protocol.
         protocol: String,
@@ -128,8 +128,8 @@ impl Monitor {
         let hasher = RandomState::new();
         Self {
             library,
-            limits: Limits::default(),
-            policy: Policy::default(),
+            limits: MonitorLimits::default(),
+            policy: MonitorPolicy::default(),
             history: History::Complete,
             agent,
             names: Names::new(hasher.clone()),
@@ -148,14 +148,14 @@ impl Monitor {
 
     /// Sets the limits.
     #[must_use]
-    pub fn with_limits(mut self, limits: Limits) -> Self {
+    pub fn with_limits(mut self, limits: MonitorLimits) -> Self {
         self.limits = limits;
         self
     }
 
     /// Sets the messages that are refused without a conversation. By default, there are none.
     #[must_use]
-    pub fn with_policy(mut self, policy: Policy) -> Self {
+    pub fn with_policy(mut self, policy: MonitorPolicy) -> Self {
         self.policy = policy;
         self
     }
@@ -208,13 +208,13 @@ impl Monitor {
     }
 
     /// Number of conversations that were evicted before their end because of
-    /// [`Limits::conversations`] or [`Limits::bytes`].
+    /// [`MonitorLimits::conversations`] or [`MonitorLimits::bytes`].
     #[must_use]
     pub fn forgotten(&self) -> u64 {
         self.forgotten
     }
 
-    /// Bytes of all conversations: see [`Limits::bytes`].
+    /// Bytes of all conversations: see [`MonitorLimits::bytes`].
     #[must_use]
     pub fn bytes(&self) -> usize {
         self.table.bytes()
@@ -1495,7 +1495,7 @@ fn take_copy(
     names: &mut Names,
     observed: &ObservedMessage<'_>,
     (fingerprint, receiver): (u64, u64),
-    limits: &Limits,
+    limits: &MonitorLimits,
 ) -> Option<Result<(), Kind>> {
     let mut all = conversation.rare.as_deref()?.copied.iter().enumerate();
     let (place, copied) = all.find(|(_, copied)| copied.fingerprint == fingerprint)?;
@@ -1823,9 +1823,9 @@ mod tests {
         let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
         let library = Arc::new(Library::standard());
         let begun = |share| {
-            let limits = Limits {
+            let limits = MonitorLimits {
                 bytes: share * 8,
-                ..Limits::default()
+                ..MonitorLimits::default()
             };
             let mut monitor = Monitor::observer(Arc::clone(&library)).with_limits(limits);
             let request = Header::new(Performative::Request).sender("ann");

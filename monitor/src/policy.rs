@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 /// message comes from a peer that predates these rules.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct Policy {
+pub struct MonitorPolicy {
     /// Whether a message with a known protocol needs a `conversation-id` (FIPA00061).
     pub conversation_id: bool,
     /// Whether a protocol name that differs from a known one by one typing error is refused.
@@ -25,7 +25,7 @@ pub struct Policy {
     pub exempt: BTreeSet<String>,
 }
 
-impl Policy {
+impl MonitorPolicy {
     /// Creates a policy that refuses all of these messages.
     #[must_use]
     pub fn strict() -> Self {
@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn exempt_protocols_are_found_in_any_case() {
-        let mut policy = Policy::strict();
+        let mut policy = MonitorPolicy::strict();
         policy.exempt.insert("fipa-query".into());
         assert!(policy.exempts("FIPA-Query") && !policy.exempts("fipa-request"));
     }

@@ -36,7 +36,7 @@ use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::machine::{Machine, Scope};
 use crate::monitor::Monitor;
 use crate::names::{Name, Names};
-use crate::{Library, Limits, Moment};
+use crate::{Library, Moment, MonitorLimits};
 
 const MAGIC: [u8; 8] = *b"fipa-cnv";
 const VERSION: u32 = 1;
@@ -83,7 +83,7 @@ impl Monitor {
     ///
     /// The snapshot omits conversations with an uncertain state: those that began between other agents,
     /// that may have begun before the monitor, or whose last message was not delivered; and those of
-    /// protocols with three or more roles. It has at most [`Limits::bytes`] bytes, and keeps the latest
+    /// protocols with three or more roles. It has at most [`MonitorLimits::bytes`] bytes, and keeps the latest
     /// conversations. The next monitor does not know the others.
     #[must_use]
     pub fn snapshot(&self, now: impl Into<Moment>) -> Vec<u8> {
@@ -192,7 +192,7 @@ impl Monitor {
 
     /// Restores the conversations of a [`snapshot`](Self::snapshot) of the same agent, before the first
     /// message. Returns their number, with embedded ones. Conversations of protocols that this monitor does
-    /// not have are left out, and so are the oldest ones if [`Limits`] are exceeded.
+    /// not have are left out, and so are the oldest ones if [`MonitorLimits`] are exceeded.
     ///
     /// # Errors
     /// If the snapshot is malformed, exceeds a limit of this monitor, or is that of another agent; or if
@@ -370,7 +370,7 @@ struct Part<'s> {
 /// The input of the checks of a snapshot.
 struct Context<'a> {
     library: &'a Library,
-    limits: &'a Limits,
+    limits: &'a MonitorLimits,
     agent: &'a str,
     now: Moment,
 }
@@ -379,7 +379,7 @@ impl<'s> Read<'s> {
     fn new(
         snapshot: &'s [u8],
         library: &Library,
-        limits: &Limits,
+        limits: &MonitorLimits,
         agent: &str,
         now: Moment,
     ) -> Result<Self, SnapshotError> {

@@ -128,7 +128,7 @@ pub enum ViolationKind {
     /// The conversation follows another protocol.
     WrongProtocol,
     /// The conversation has too many participants or embedded conversations: see
-    /// [`Limits`](crate::Limits).
+    /// [`MonitorLimits`](crate::MonitorLimits).
     TooMany,
     /// The message exceeds the limits of the monitor, so that it cannot be checked: its
     /// conversation-id or a name is too long, or it names too many agents. An observer has
@@ -221,7 +221,7 @@ impl ViolationKind {
         }
     }
 
-    /// Whether a [`Policy`](crate::Policy) causes the violation, and not the state of a conversation.
+    /// Whether a [`MonitorPolicy`](crate::MonitorPolicy) causes the violation, and not the state of a conversation.
     #[must_use]
     pub fn depends_on_policy(self) -> bool {
         matches!(

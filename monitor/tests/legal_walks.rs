@@ -17,7 +17,9 @@ use std::time::{Duration, SystemTime};
 
 use fastrand::Rng;
 use fipa_acl::Performative;
-use fipa_monitor::{Header, History, Library, Limits, Machine, Monitor, Scope, State, Transition};
+use fipa_monitor::{
+    Header, History, Library, Machine, Monitor, MonitorLimits, Scope, State, Transition,
+};
 use regex::Regex;
 
 const AGENTS: [&str; 5] = ["ann", "ben", "cid", "dan", "eve"];
@@ -156,7 +158,7 @@ impl<'l> World<'l> {
     }
 
     fn monitor(&mut self, agent: usize, history: History) -> Monitor {
-        let mut limits = Limits::default();
+        let mut limits = MonitorLimits::default();
         // Some monitors forget conversations.
         limits.conversations = if self.rng.bool() { 6 } else { 100_000 };
         let monitor = Monitor::agent(Arc::clone(&self.shared), AGENTS[agent]);

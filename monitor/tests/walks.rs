@@ -13,7 +13,7 @@ use std::time::{Duration, SystemTime};
 
 use fastrand::Rng;
 use fipa_acl::{Performative, Time};
-use fipa_monitor::{Header, Library, Limits, Machine, Monitor, State, Verdict};
+use fipa_monitor::{Header, Library, Machine, Monitor, MonitorLimits, State, Verdict};
 use reference::{Reference, ReferenceVerdict, Words, matches, options};
 
 static ACTS: LazyLock<Vec<&'static str>> = LazyLock::new(|| {
@@ -299,7 +299,7 @@ fn walk(seed: u64, steps: u64) -> [u64; 3] {
         None => Monitor::observer(shared),
     };
     // Other tests cover the removal of conversations.
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.ended = Duration::from_secs(1 << 40);
     limits.idle = limits.ended;
     limits.conversations = usize::try_from(steps).unwrap() + 1;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now};
-use fipa_mts::{AccessGate, LetterParts, Link, LetterSource, letter_for};
+use fipa_mts::{AccessGate, LetterParts, LetterSource, Link, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal,

@@ -15,8 +15,8 @@ use crate::kept::{KeptDescription, Text, left, read_object};
 use crate::request::{self, Rejection, Request};
 use crate::search::max_results;
 use crate::{
-    AddressBook, AmsDescription, Answer, ApDescription, Asker, Platform, PlatformTime, State,
-    addresses_for, limits, located,
+    AddressBook, AgentState, AmsDescription, ApDescription, Asker, Platform, PlatformAnswer,
+    PlatformTime, addresses_for, limits, located,
 };
 
 /// The agent management system of a platform.
@@ -33,7 +33,7 @@ pub struct Ams {
     residents: BTreeMap<Arc<str>, (u64, AmsDescription)>,
     /// The agents that platforms of other hosts have registered.
     foreign: BTreeMap<(Platform, Arc<str>), Foreign>,
-    answers: VecDeque<Answer>,
+    answers: VecDeque<PlatformAnswer>,
     revision: u64,
     addresses: Option<AddressBook>,
 }
@@ -130,7 +130,7 @@ impl Ams {
     }
 
     /// Returns the next message to be sent.
-    pub fn poll_answer(&mut self) -> Option<Answer> {
+    pub fn poll_answer(&mut self) -> Option<PlatformAnswer> {
         self.answers.pop_front()
     }
 
@@ -358,7 +358,7 @@ impl Ams {
             Some(AmsDescription {
                 name: Some(AgentId::new(&*resident.name).ok()?),
                 ownership: set.and_then(|set| set.ownership.clone()),
-                state: Some(set.and_then(|set| set.state).unwrap_or(State::Active)),
+                state: Some(set.and_then(|set| set.state).unwrap_or(AgentState::Active)),
             })
         });
         let foreign = self.foreign.iter();
@@ -420,7 +420,7 @@ fn own_description(asker: &Asker, request: &Request<'_>) -> Result<AmsDescriptio
         return Err(Exception::InternalError(words.to_owned()));
     }
     Ok(AmsDescription {
-        state: description.state.or(Some(State::Active)),
+        state: description.state.or(Some(AgentState::Active)),
         ..description
     })
 }

@@ -68,13 +68,13 @@ pub struct AmsDescription {
     /// The owner of the agent.
     pub ownership: Option<String>,
     /// The state of its life cycle.
-    pub state: Option<State>,
+    pub state: Option<AgentState>,
 }
 
 /// A state of the life cycle of an agent (FIPA00023 clause 5.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[allow(clippy::exhaustive_enums, reason = "the standard is final")]
-pub enum State {
+pub enum AgentState {
     /// Not invoked yet.
     Initiated,
     /// Running.
@@ -318,7 +318,7 @@ impl AmsDescription {
         let slots = Slots::of(term, AMS_DESCRIPTION, &["name", "ownership", "state"])?;
         let state = slots.text("state")?;
         let state = state.map(|state| {
-            State::of(&state).ok_or_else(|| Exception::unrecognised(AMS_DESCRIPTION, "state"))
+            AgentState::of(&state).ok_or_else(|| Exception::unrecognised(AMS_DESCRIPTION, "state"))
         });
         Ok(Self {
             name: slots.agent("name")?,
@@ -333,7 +333,7 @@ impl AmsDescription {
         Builder::default()
             .slot("name", self.name.as_ref().map(Term::from))
             .text("ownership", self.ownership.as_deref())
-            .text("state", self.state.map(State::as_str))
+            .text("state", self.state.map(AgentState::as_str))
             .build(AMS_DESCRIPTION)
     }
 
@@ -347,7 +347,7 @@ impl AmsDescription {
     }
 }
 
-impl State {
+impl AgentState {
     const ALL: [Self; 5] = [
         Self::Initiated,
         Self::Active,
@@ -376,7 +376,7 @@ impl State {
     }
 }
 
-impl fmt::Display for State {
+impl fmt::Display for AgentState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(self.as_str())
     }

@@ -17,7 +17,7 @@ use crate::request::{self, Rejection, Request};
 use crate::search::{Comparisons, max_results};
 use crate::subscription::{Subscription, checked_template};
 use crate::{
-    AddressBook, AgentDescription, Answer, Asker, Platform, PlatformTime, SubscriptionId,
+    AddressBook, AgentDescription, Asker, Platform, PlatformAnswer, PlatformTime, SubscriptionId,
     addresses_for, limits, located,
 };
 
@@ -49,7 +49,7 @@ pub struct Df {
     /// The identifiers of the latest searches, the oldest first.
     search_ids: VecDeque<Arc<str>>,
     known_search_ids: HashSet<Arc<str>>,
-    answers: VecDeque<Answer>,
+    answers: VecDeque<PlatformAnswer>,
     revision: u64,
     addresses: Option<AddressBook>,
 }
@@ -426,7 +426,7 @@ impl Df {
     }
 
     /// Returns the next message to be sent.
-    pub fn poll_answer(&mut self) -> Option<Answer> {
+    pub fn poll_answer(&mut self) -> Option<PlatformAnswer> {
         self.answers.pop_front()
     }
 
@@ -905,7 +905,7 @@ impl Df {
             let content = subscription.notification(&found.texts);
             let notification = request::reply(message, asker, &self.id, Performative::Inform);
             let answer = request::answer(asker, notification.content(content));
-            self.answers.extend(answer.map(|answer| Answer {
+            self.answers.extend(answer.map(|answer| PlatformAnswer {
                 notification: Some(*id),
                 ..answer
             }));

@@ -2,7 +2,7 @@
 //! agents of the platform, and the directory facilitator ([`Df`]) lists the services of agents.
 //!
 //! Both are cores without sockets, threads and clocks: messages, the asker and [`PlatformTime`] go in,
-//! [`Answer`]s come out. Registration, deregistration, modification and search follow
+//! [`PlatformAnswer`]s come out. Registration, deregistration, modification and search follow
 //! `fipa-request`, subscriptions to the directory facilitator follow `fipa-subscribe`, in the ontology
 //! [`ONTOLOGY`] and the language FIPA-SL. [`AgentDescription`] and the other descriptions are the
 //! objects of that ontology; [`Exception`] has the reasons of refusals and failures. [`Function`]
@@ -106,8 +106,8 @@ use serde::{Deserialize, Serialize};
 pub use ams::{Ams, Resident};
 pub use client::{AnswerError, Function, found, notified, registered, subscription};
 pub use description::{
-    AgentDescription, AmsDescription, ApDescription, Constraints, Property, ServiceDescription,
-    State,
+    AgentDescription, AgentState, AmsDescription, ApDescription, Constraints, Property,
+    ServiceDescription,
 };
 pub use df::Df;
 pub use exception::Exception;
@@ -215,7 +215,7 @@ pub(crate) fn located(id: AgentId, addresses: &[String]) -> AgentId {
 /// A message that an agent of this crate sends.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
-pub struct Answer {
+pub struct PlatformAnswer {
     /// The name of the receiving agent.
     pub to: Arc<str>,
     /// The registration of the receiving agent: see [`Asker::registration`].

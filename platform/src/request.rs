@@ -8,7 +8,7 @@ use fipa_content::{
 };
 
 use crate::exception::{Exception, repeated};
-use crate::{Answer, Asker, ONTOLOGY, limits};
+use crate::{Asker, ONTOLOGY, PlatformAnswer, limits};
 
 /// Language of answers to messages that name none.
 const LANGUAGE: &str = "fipa-sl0";
@@ -238,8 +238,8 @@ pub(crate) fn reply(
 
 /// Returns an answer to the agent that asked. A message that cannot be built, because the request has a
 /// parameter that no encoding has, is not answered.
-pub(crate) fn answer(asker: &Asker, message: MessageBuilder) -> Option<Answer> {
-    Some(Answer {
+pub(crate) fn answer(asker: &Asker, message: MessageBuilder) -> Option<PlatformAnswer> {
+    Some(PlatformAnswer {
         to: asker.id.name().into(),
         registration: asker.registration,
         message: message.build().ok()?,

@@ -8,8 +8,8 @@ use common::{Management, OTHER, asker, id, local, message, text};
 use fipa_acl::{Message, Performative};
 use fipa_content::SlDialect;
 use fipa_platform::{
-    AmsDescription, ApDescription, Asker, Constraints, Exception, Function, Platform, Resident,
-    State, limits,
+    AgentState, AmsDescription, ApDescription, Asker, Constraints, Exception, Function, Platform,
+    Resident, limits,
 };
 
 fn agent(name: &str) -> AmsDescription {
@@ -35,7 +35,7 @@ fn agents_of_the_host_are_listed_without_registration() {
     let registered = it.call(0.0, &local("arm"), &Function::register_agent(&agent("arm")));
     assert_eq!(registered, Err(Exception::AlreadyRegistered));
     let template = AmsDescription {
-        state: Some(State::Active),
+        state: Some(AgentState::Active),
         ..agent("ROVER")
     };
     let search = Function::search_agents(&template, &Constraints::all());
@@ -57,7 +57,7 @@ fn an_agent_of_the_host_sets_its_owner_and_state_until_it_ends() {
     let mut it = Management::new();
     let waiting = AmsDescription {
         ownership: Some("ACME".to_owned()),
-        state: Some(State::Waiting),
+        state: Some(AgentState::Waiting),
         ..agent("arm")
     };
     let modify = Function::modify_agent(&waiting);

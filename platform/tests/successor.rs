@@ -12,8 +12,8 @@ use common::{
 use fipa_acl::{AgentId, Message, Performative, Time};
 use fipa_content::{SlDialect, Term};
 use fipa_platform::{
-    AgentDescription, AmsDescription, Asker, Constraints, Exception, Function, KeptDescription,
-    KeptSubscription, Platform, Property, ServiceDescription, State, limits, notified,
+    AgentDescription, AgentState, AmsDescription, Asker, Constraints, Exception, Function,
+    KeptDescription, KeptSubscription, Platform, Property, ServiceDescription, limits, notified,
     subscription,
 };
 
@@ -289,7 +289,7 @@ fn agents_and_owners_come_back() {
     let of = |name: &str, owner: &str| AmsDescription {
         name: Some(id(name)),
         ownership: Some(owner.to_owned()),
-        state: Some(State::Suspended),
+        state: Some(AgentState::Suspended),
     };
     for (asker, function) in [
         (local("arm"), Function::modify_agent(&of("arm", "me"))),
@@ -322,7 +322,7 @@ fn agents_and_owners_come_back() {
     let active = AmsDescription {
         name: Some(id("rover")),
         ownership: None,
-        state: Some(State::Active),
+        state: Some(AgentState::Active),
     };
     assert_eq!(found, [of("arm", "me"), active, of("jade", "x")]);
     assert_eq!(next.ams.foreign().count(), 1);

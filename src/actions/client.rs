@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 use fipa_actions::{
-    ActionDescription, Answer, Ask, Failure, Goal, GoalError, GoalStatus, Json, Language,
+    ActionAnswer, ActionDescription, Ask, Failure, Goal, GoalError, GoalStatus, Json, Language,
     LanguageError, ONTOLOGY, Refusal, Sl, language,
 };
 use fipa_content::{DeserializeError, Term};
@@ -56,8 +56,8 @@ impl From<DialogueError> for ActionError {
         let language = language(message.language());
         let read = language.and_then(|it| it.read_rejection(is_refusal, content).ok());
         match read {
-            Some(Answer::Refused(reason)) => Self::Refused(reason),
-            Some(Answer::Failed(reason)) => Self::Failed(reason),
+            Some(ActionAnswer::Refused(reason)) => Self::Refused(reason),
+            Some(ActionAnswer::Failed(reason)) => Self::Failed(reason),
             _ => Self::Dialogue(error),
         }
     }
@@ -106,7 +106,7 @@ impl<'a> Robot<'a> {
     /// If the robot is gone, refuses, or does not answer in time.
     pub async fn actions(&self) -> Result<Vec<ActionDescription>, ActionError> {
         match self.query(&Ask::Actions).await? {
-            Answer::Actions(all) => Ok(all),
+            ActionAnswer::Actions(all) => Ok(all),
             _ => Err(ActionError::Answer(LanguageError::Form(
                 "a list of actions",
             ))),
@@ -119,7 +119,7 @@ impl<'a> Robot<'a> {
     /// See [`actions`](Self::actions).
     pub async fn status(&self) -> Result<Vec<GoalStatus>, ActionError> {
         match self.query(&Ask::Status).await? {
-            Answer::Status(all) => Ok(all),
+            ActionAnswer::Status(all) => Ok(all),
             _ => Err(ActionError::Answer(LanguageError::Form("a list of goals"))),
         }
     }
@@ -208,7 +208,7 @@ impl<'a> Robot<'a> {
         Ok(message.content(content))
     }
 
-    async fn query(&self, ask: &Ask) -> Result<Answer, ActionError> {
+    async fn query(&self, ask: &Ask) -> Result<ActionAnswer, ActionError> {
         let message = self.message(Performative::QueryRef, ask)?;
         let request = self.agent.query(message, self.timeout()).await?;
         let answer = request.result().await?;
@@ -220,7 +220,7 @@ fn read(
     language: &'static dyn Language,
     ask: &Ask,
     message: &Message,
-) -> Result<Answer, ActionError> {
+) -> Result<ActionAnswer, ActionError> {
     let content = message.content().map_or(&[][..], |content| content);
     let answer = language.read_answer(ask, content);
     answer.map_err(ActionError::Answer)
@@ -290,7 +290,7 @@ impl GoalHandle<'_> {
     pub async fn outcome(&mut self) -> Result<Option<Term<'static>>, ActionError> {
         let message = self.request.finished().await?;
         match read(self.robot.language, &self.ask, &message)? {
-            Answer::Done(value) => Ok(value),
+            ActionAnswer::Done(value) => Ok(value),
             _ => Err(LanguageError::Form("a result").into()),
         }
     }
@@ -336,7 +336,7 @@ impl ProgressUpdates {
             return Ok(None);
         };
         let message = subscription.next().await?;
-        let Answer::Status(mut all) = read(self.language, &self.ask, &message)? else {
+        let ActionAnswer::Status(mut all) = read(self.language, &self.ask, &message)? else {
             return Err(LanguageError::Form("a status").into());
         };
         let status = all.pop();
@@ -369,7 +369,7 @@ impl StatusUpdates {
     pub async fn next(&mut self) -> Result<Vec<GoalStatus>, ActionError> {
         let message = self.subscription.next().await?;
         match read(self.language, &self.ask, &message)? {
-            Answer::Status(all) => Ok(all),
+            ActionAnswer::Status(all) => Ok(all),
             _ => Err(ActionError::Answer(LanguageError::Form("a list of goals"))),
         }
     }

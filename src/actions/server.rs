@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_actions::{
-    Answer, Ask, Failure, Goal, Language, MAX_CONTENT, ONTOLOGY, Refusal, language,
+    ActionAnswer, Ask, Failure, Goal, Language, MAX_CONTENT, ONTOLOGY, Refusal, language,
 };
 
 use crate::actions::table::ActionTable;
@@ -91,18 +91,18 @@ impl Side {
         Ok(ask)
     }
 
-    fn write(&self, to: &Ask, answer: &Answer) -> Vec<u8> {
+    fn write(&self, to: &Ask, answer: &ActionAnswer) -> Vec<u8> {
         let language = self.language.unwrap_or(&fipa_actions::Sl);
         let written = language.write_answer(&self.robot, to, answer);
         written.unwrap_or_else(|error| {
             let failure = Failure::Failed(format!("the answer has no notation: {error}"));
-            let written = language.write_answer(&self.robot, to, &Answer::Failed(failure));
+            let written = language.write_answer(&self.robot, to, &ActionAnswer::Failed(failure));
             written.unwrap_or_default()
         })
     }
 
     fn refuse(&self, to: &Ask, reason: Refusal) -> Reply {
-        Reply::Refuse(self.write(to, &Answer::Refused(reason)).into())
+        Reply::Refuse(self.write(to, &ActionAnswer::Refused(reason)).into())
     }
 
     fn refuse_unread(&self, reason: Refusal) -> Reply {
@@ -132,7 +132,7 @@ impl Side {
         };
         let queued = accepted.queued;
         let agreed = task
-            .agree(self.write(&reference, &Answer::Agreed { queued }))
+            .agree(self.write(&reference, &ActionAnswer::Agreed { queued }))
             .await;
         if agreed.is_err() {
             // Dropping the conversation cancels the goal: its client is gone.
@@ -160,12 +160,13 @@ impl Side {
                 },
             }
         };
-        let content = |answer: &Answer| self.write(&reference, answer).into();
+        let content = |answer: &ActionAnswer| self.write(&reference, answer).into();
         match outcome {
             Err(_) if cancelled => task.confirm_cancel().await.unwrap_or(Reply::Nothing),
-            Err(failure) => Reply::Failure(content(&Answer::Failed(failure))),
+            Err(failure) => Reply::Failure(content(&ActionAnswer::Failed(failure))),
             Ok(value) => {
-                let too_late = Answer::Failed(Failure::Failed("the action is done".to_owned()));
+                let too_late =
+                    ActionAnswer::Failed(Failure::Failed("the action is done".to_owned()));
                 if cancelled
                     && task
                         .fail_cancel(self.write(&reference, &too_late))
@@ -177,12 +178,12 @@ impl Side {
                 match self.language.unwrap_or(&fipa_actions::Sl).write_answer(
                     &self.robot,
                     &reference,
-                    &Answer::Done(value),
+                    &ActionAnswer::Done(value),
                 ) {
                     Ok(content) => Reply::Inform(content.into()),
                     Err(error) => {
                         let failure = format!("the result has no notation: {error}");
-                        Reply::Failure(content(&Answer::Failed(Failure::Failed(failure))))
+                        Reply::Failure(content(&ActionAnswer::Failed(Failure::Failed(failure))))
                     }
                 }
             }
@@ -199,10 +200,10 @@ impl Side {
             Err(reason) => return self.refuse_unread(reason),
         };
         let answer = match &ask {
-            Ask::Actions => Answer::Actions(self.table.descriptions()),
-            Ask::Status => Answer::Status(self.table.status()),
+            Ask::Actions => ActionAnswer::Actions(self.table.descriptions()),
+            Ask::Status => ActionAnswer::Status(self.table.status()),
             Ask::StatusOf(id) => match self.table.status_of(&self.client, id) {
-                Some(status) => Answer::Status(vec![status]),
+                Some(status) => ActionAnswer::Status(vec![status]),
                 None => return self.refuse(&ask, Refusal::UnknownGoal(id.clone())),
             },
             _ => return self.refuse_unread(Refusal::Malformed("a goal in a query".into())),
@@ -230,12 +231,13 @@ impl Side {
                     loop {
                         let now = status.borrow_and_update().clone();
                         let is_over = now.state.is_over();
-                        let content = self.write(&ask, &Answer::Status(vec![now]));
+                        let content = self.write(&ask, &ActionAnswer::Status(vec![now]));
                         if task.inform(content).await.is_err() {
                             return Reply::Nothing;
                         }
                         if is_over {
-                            let end = Answer::Failed(Failure::Failed("the goal has ended".into()));
+                            let end =
+                                ActionAnswer::Failed(Failure::Failed("the goal has ended".into()));
                             return Reply::Failure(self.write(&ask, &end).into());
                         }
                         tokio::select! {
@@ -254,7 +256,7 @@ impl Side {
                 let mut changes = self.table.changes();
                 loop {
                     changes.mark_unchanged();
-                    let content = self.write(&ask, &Answer::Status(self.table.status()));
+                    let content = self.write(&ask, &ActionAnswer::Status(self.table.status()));
                     if task.inform(content).await.is_err() {
                         return Reply::Nothing;
                     }

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::AgentId;
 use fipa_actions::{
-    ActionDescription, Cause, Executor, Failure, Goal, GoalStatus, Limits, OfferOptions,
+    ActionDescription, ActionLimits, Cause, Executor, Failure, Goal, GoalStatus, OfferOptions,
     OfferRefused, Output, Progress, Refusal, Running,
 };
 use fipa_content::Term;
@@ -69,7 +69,7 @@ impl Default for State {
     fn default() -> Self {
         Self {
             began: Instant::now(),
-            executor: Executor::new(Limits::default()),
+            executor: Executor::new(ActionLimits::default()),
             handlers: HashMap::new(),
             tasks: HashMap::new(),
             conversations: HashMap::new(),

@@ -3,7 +3,7 @@
 //! A process reports its own routes with [`Domain::routes`](crate::Domain::routes), and queries those
 //! of the gateway on its host with [`of_gateway`]. The query is a `request` to the gateway with the
 //! [`ONTOLOGY`]; its content is the name or pattern of the receivers, or empty for all. The answer is
-//! an `inform` in the language `json` whose content is a [`Report`].
+//! an `inform` in the language `json` whose content is a [`RouteReport`].
 
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use fipa_sds::Entry;
 use fipa_transport::Incarnation;
 
 pub use crate::domain::report::{
-    Connected, ContestedName, LinkSecurity, Namesakes, RefusedConnection, RefusedDial, Report,
+    Connected, ContestedName, LinkSecurity, Namesakes, RefusedConnection, RefusedDial, RouteReport,
     StaticPeer,
 };
 use crate::{Agent, Deliveries, Message, ReceiveError, SendError};
@@ -65,7 +65,7 @@ pub async fn of_gateway(
     gateway: &Entry,
     receivers: Option<&str>,
     timeout: Duration,
-) -> Result<Report, AskError> {
+) -> Result<RouteReport, AskError> {
     let request = (ONTOLOGY, receivers.map(str::to_owned));
     let answer = ask(agent, gateway, request, timeout).await?;
     let content = answer.content().map(|bytes| &bytes[..]).unwrap_or_default();

@@ -8,8 +8,8 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{Message, Performative};
 use fipa_monitor::{
-    Header, History, Library, LibraryError, LibraryFull, Limits, Moment, Monitor, Policy,
-    SnapshotError, Verdict, Violation, ViolationKind,
+    Header, History, Library, LibraryError, LibraryFull, Moment, Monitor, MonitorLimits,
+    MonitorPolicy, SnapshotError, Verdict, Violation, ViolationKind,
 };
 use fipa_mts::core::Received;
 use fipa_sds::{Directory, Entry, Reach, Resolution, Role, resolve};
@@ -26,8 +26,8 @@ pub(crate) struct Rules {
     check: Check,
     answer: bool,
     heartbeat: Duration,
-    limits: Limits,
-    policy: Policy,
+    limits: MonitorLimits,
+    policy: MonitorPolicy,
 }
 
 impl Rules {
@@ -43,11 +43,11 @@ impl Rules {
                 _ => ProtocolError::Full(LibraryFull),
             })?;
         }
-        let mut limits = Limits::default();
+        let mut limits = MonitorLimits::default();
         limits.idle = config.idle;
         limits.conversations = config.conversations;
         limits.bytes = usize::try_from(config.bytes).unwrap_or(usize::MAX);
-        let mut policy = Policy::strict();
+        let mut policy = MonitorPolicy::strict();
         policy.exempt = config.exempt.iter().cloned().collect();
         Ok(Self {
             limits,

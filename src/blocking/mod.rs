@@ -38,7 +38,7 @@ use fipa_sds::{Cancellation, DeregisterError, RegisterError};
 use fipa_transport::threads;
 use tokio::runtime::{Builder, Handle, Runtime};
 
-use crate::admin::routes::Report;
+use crate::admin::routes::RouteReport;
 use crate::config::Sources;
 use crate::domain::process::Owner;
 use crate::{
@@ -295,7 +295,7 @@ impl Domain {
 
     /// Reports the routes of letters; see [`crate::Domain::routes`].
     #[must_use]
-    pub fn routes(&self, to: &Query) -> Report {
+    pub fn routes(&self, to: &Query) -> RouteReport {
         self.domain.routes(to)
     }
 

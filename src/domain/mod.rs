@@ -22,7 +22,7 @@ use fipa_sds::{Cancellation, Entry, Query, Watch};
 use fipa_transport::log_limit;
 use tokio::runtime::Handle;
 
-use self::report::Report;
+use self::report::RouteReport;
 use crate::agent::checks::Rules;
 use crate::agent::lock_slot;
 use crate::agent::stated::Introductions;
@@ -230,7 +230,7 @@ impl Domain {
     /// the state of each route. For agents on other hosts, the report contains the route to the
     /// gateway; [`routes::of_gateway`](crate::admin::routes::of_gateway) reports the routes from there.
     #[must_use]
-    pub fn routes(&self, to: &Query) -> Report {
+    pub fn routes(&self, to: &Query) -> RouteReport {
         let entries = report::agents(&*self.inner.service.host, to);
         self.inner.service.report(&entries)
     }

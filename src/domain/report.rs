@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 /// Serialized as a JSON object with the names of the fields.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
-pub struct Report {
+pub struct RouteReport {
     /// The name of the service.
     pub mts: String,
     /// The incarnation of the service: a random number per start.

@@ -21,7 +21,7 @@ use crate::admin::watch::Watchers;
 use crate::domain::files::DomainDir;
 use crate::domain::maintenance::DirMaintenance;
 use crate::domain::membership::{self, Membership};
-use crate::domain::report::Report;
+use crate::domain::report::RouteReport;
 use crate::error::OpenError;
 
 /// Interval of keep-alive messages on an idle connection. A broken connection, for example after a
@@ -238,8 +238,8 @@ impl Service {
     }
 
     /// Reports the routes that letters to these agents would take now.
-    pub(crate) fn report(&self, to: &[Arc<Entry>]) -> Report {
-        Report {
+    pub(crate) fn report(&self, to: &[Arc<Entry>]) -> RouteReport {
+        RouteReport {
             mts: self.name.to_string(),
             incarnation: self.own.incarnation,
             locations: self.locations(),
@@ -633,14 +633,14 @@ fn udt_limits(config: &Config) -> fipa_transport_net::UdtLimits {
 }
 
 /// Returns the limits of the transports that carry letters of any size.
-fn stream_limits(config: &Config) -> fipa_transport_net::Limits {
-    fipa_transport_net::Limits {
+fn stream_limits(config: &Config) -> fipa_transport_net::NetLimits {
+    fipa_transport_net::NetLimits {
         max_letter: usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX),
         keep_alive: KEEP_ALIVE,
         max_per_address: config.security.peer_connections,
         peer_letters: config.security.peer_letters as u64,
         peer_bytes: config.security.peer_bytes,
-        ..fipa_transport_net::Limits::default()
+        ..fipa_transport_net::NetLimits::default()
     }
 }
 

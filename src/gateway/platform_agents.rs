@@ -15,7 +15,7 @@ use fipa_mts::core::{Received, Submission};
 use fipa_mts::dial::Endpoint;
 use fipa_mts::{Sending, letter_for};
 use fipa_platform::{
-    AddressBook, Ams, Answer, ApDescription, Asker, Df, LocalEntry, Platform, PlatformTime,
+    AddressBook, Ams, ApDescription, Asker, Df, LocalEntry, Platform, PlatformAnswer, PlatformTime,
     RemoteEntry, Resident, SubscriptionId, limits,
 };
 use fipa_sds::{
@@ -232,7 +232,7 @@ impl PlatformAgents {
     }
 
     /// Sends a message of an agent of this gateway.
-    fn send(&self, from: Incarnation, answer: &Answer) -> Option<Sending> {
+    fn send(&self, from: Incarnation, answer: &PlatformAnswer) -> Option<Sending> {
         let letter = letter_for(&answer.message, SystemTime::now());
         let letter = letter
             .inspect_err(|error| log_limit::warn!(error = %ErrorChain(error), "cannot encode a letter of the gateway"))
@@ -653,7 +653,7 @@ impl Task {
     }
 
     /// Returns the registration that sends an answer: that which was asked.
-    fn sender(&self, answer: &Answer) -> Incarnation {
+    fn sender(&self, answer: &PlatformAnswer) -> Incarnation {
         let second = self.second().filter(|second| {
             let sender = answer.message.sender();
             sender.is_some_and(|sender| sender.name() == second.name())

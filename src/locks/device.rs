@@ -4,7 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use fipa_acl::Message;
-use fipa_locking::{Admission, Fence, NotAdmitted, Peer};
+use fipa_locking::{Admission, Fence, LockPeer, NotAdmitted};
 use parking_lot::Mutex;
 
 use super::shell::{self, Shared};
@@ -63,8 +63,8 @@ impl Device {
             NotAdmitted::OtherRun { highest } => {
                 let directory = self.core.endpoint.domain.directory();
                 let listed = owned::listed_owner(directory, &resource);
-                let listed =
-                    listed.and_then(|(it, _)| Peer::new(&it.name, it.incarnation.as_u64()).ok());
+                let listed = listed
+                    .and_then(|(it, _)| LockPeer::new(&it.name, it.incarnation.as_u64()).ok());
                 let listed = listed.filter(|listed| listed.name() == owner);
                 self.shared.saw(&self.core, listed.as_ref(), &highest, true);
                 AdmitError::OtherRun {

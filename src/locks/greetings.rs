@@ -4,7 +4,7 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::net::{IpAddr, Ipv4Addr};
 use std::time::{Duration, Instant};
 
-use fipa_locking::Peer;
+use fipa_locking::LockPeer;
 use fipa_transport::{PeerId, TokenBucket};
 
 use crate::protocol::peer_shares::PeerShares;
@@ -30,9 +30,9 @@ const READ_AGAIN: Duration = Duration::from_secs(30);
 #[derive(Debug)]
 pub(super) struct Greetings {
     /// The agents that were greeted or wait.
-    known: HashSet<Peer>,
+    known: HashSet<LockPeer>,
     /// The known agents that wait for a greeting.
-    waiting: HashSet<Peer>,
+    waiting: HashSet<LockPeer>,
     peers: HashMap<PeerId, OfPeer>,
     /// The peers with agents that wait, in the order of their turns.
     turns: VecDeque<PeerId>,
@@ -48,7 +48,7 @@ pub(super) struct Greetings {
 struct OfPeer {
     bucket: TokenBucket,
     /// Agents that wait, and some that have left.
-    queue: VecDeque<Peer>,
+    queue: VecDeque<LockPeer>,
     /// Whether the peer is known by its address only.
     is_address: bool,
 }
@@ -69,7 +69,7 @@ impl Greetings {
 
     /// Handles an agent that this peer announces. Returns whether it is greeted now: not if it was before, and not if it
     /// has to wait.
-    pub(super) fn announced(&mut self, now: Instant, by: &PeerId, agent: &Peer) -> bool {
+    pub(super) fn announced(&mut self, now: Instant, by: &PeerId, agent: &LockPeer) -> bool {
         if self.known.contains(agent) {
             return false;
         }
@@ -104,13 +104,13 @@ impl Greetings {
     }
 
     /// Handles an agent that has left the directory.
-    pub(super) fn left(&mut self, agent: &Peer) {
+    pub(super) fn left(&mut self, agent: &LockPeer) {
         self.known.remove(agent);
         self.waiting.remove(agent);
     }
 
     /// Keeps these agents only.
-    pub(super) fn retain(&mut self, is_present: impl Fn(&Peer) -> bool) {
+    pub(super) fn retain(&mut self, is_present: impl Fn(&LockPeer) -> bool) {
         self.known.retain(&is_present);
         self.waiting.retain(is_present);
     }
@@ -124,7 +124,7 @@ impl Greetings {
     }
 
     /// Returns the agents to greet now.
-    pub(super) fn due(&mut self, now: Instant) -> Vec<Peer> {
+    pub(super) fn due(&mut self, now: Instant) -> Vec<LockPeer> {
         let mut due = Vec::new();
         if self.next.is_none_or(|next| now < next) {
             return due;
@@ -159,7 +159,7 @@ impl Greetings {
     }
 
     /// Returns the first agent of this peer that waits, and drops those in front of it that have left.
-    fn first_waiting(&mut self, by: &PeerId) -> Option<Peer> {
+    fn first_waiting(&mut self, by: &PeerId) -> Option<LockPeer> {
         loop {
             let first = self.peers.get(by)?.queue.front()?.clone();
             if self.waiting.contains(&first) {
@@ -237,12 +237,12 @@ mod tests {
         PeerId::of_ip([192, 0, 2, number].into())
     }
 
-    fn agent(name: &str, number: u64) -> Peer {
-        Peer::new(&format!("{name}-{number}"), number + 1).unwrap()
+    fn agent(name: &str, number: u64) -> LockPeer {
+        LockPeer::new(&format!("{name}-{number}"), number + 1).unwrap()
     }
 
     /// Greets what is due until this time, and returns it.
-    fn run(greetings: &mut Greetings, until: Instant) -> Vec<(Instant, Peer)> {
+    fn run(greetings: &mut Greetings, until: Instant) -> Vec<(Instant, LockPeer)> {
         let mut all = Vec::new();
         while let Some(now) = greetings.poll_timeout().filter(|at| *at <= until) {
             all.extend(greetings.due(now).into_iter().map(|it| (now, it)));
@@ -330,8 +330,8 @@ mod tests {
     fn agents_that_find_no_place_are_greeted_later() {
         let now = Instant::now();
         let mut greetings = Greetings::new(now);
-        let all: Vec<Peer> = (0..6_000).map(|it| agent("a", it)).collect();
-        let mut greeted: HashSet<Peer> = HashSet::new();
+        let all: Vec<LockPeer> = (0..6_000).map(|it| agent("a", it)).collect();
+        let mut greeted: HashSet<LockPeer> = HashSet::new();
         let mut at = now;
         for _ in 0..20 {
             let some = all.iter();
@@ -385,7 +385,7 @@ mod tests {
         }
         let greeted = run(&mut greetings, now + 6 * SECOND);
         for (by, number) in honest {
-            let is_it = |(_, it): &(Instant, Peer)| *it == agent("honest", number);
+            let is_it = |(_, it): &(Instant, LockPeer)| *it == agent("honest", number);
             assert!(greeted.iter().any(is_it), "{by}");
         }
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::MessageBuilder;
-use fipa_locking::{Algorithm, AnyAlgorithm, ClaimId, Fence, Locks, Millis, Peer, Resource};
+use fipa_locking::{Algorithm, AnyAlgorithm, ClaimId, Fence, LockPeer, Locks, Millis, Resource};
 use tokio::sync::watch;
 
 use super::shell::{self, ClaimState, Shared};
@@ -182,12 +182,12 @@ fn listed_owners(
     core: &AgentCore,
     shared: &Shared,
     resources: &[Resource],
-) -> Vec<(Resource, Peer, Option<Algorithm>)> {
+) -> Vec<(Resource, LockPeer, Option<Algorithm>)> {
     let directory = core.endpoint.domain.directory();
     let listed = |resource: &Resource| {
         let known = shared.read(|locks, _| locks.owner_of(resource).cloned());
         let (owner, algorithm) = owned::listed_owner(directory, resource)?;
-        let owner = Peer::new(&owner.name, owner.incarnation.as_u64()).ok()?;
+        let owner = LockPeer::new(&owner.name, owner.incarnation.as_u64()).ok()?;
         (known.as_ref() != Some(&owner)).then(|| (resource.clone(), owner, algorithm))
     };
     resources.iter().filter_map(listed).collect()

@@ -13,7 +13,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Message, Performative};
-use fipa_locking::{Fence, LockStatus, Millis, Peer, Resource};
+use fipa_locking::{Fence, LockPeer, LockStatus, Millis, Resource};
 use fipa_mts::letter_for;
 use fipa_transport::log_limit;
 use serde::{Deserialize, Serialize};
@@ -76,8 +76,8 @@ impl ResourceStatus {
         }
     }
 
-    pub(super) fn of(status: &LockStatus, me: &Peer, now: Millis) -> Self {
-        let name = |peer: &Peer| peer.name().to_owned();
+    pub(super) fn of(status: &LockStatus, me: &LockPeer, now: Millis) -> Self {
+        let name = |peer: &LockPeer| peer.name().to_owned();
         let grant = status.grant.as_ref();
         let expires = grant.and_then(|grant| grant.expires);
         Self {

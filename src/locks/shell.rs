@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, ErrorChain, Performative, escape, escape_name};
 use fipa_locking::{
     Action, Algorithm, AnyAlgorithm, ClaimId, Event, Failure, Fence, LockDialect, LockMessage,
-    Locks, Millis, Peer, Resource, codec,
+    LockPeer, Locks, Millis, Resource, codec,
 };
 use fipa_mts::letter_for;
 use fipa_sds::{Change, Entry, Reach, Role, Watch};
@@ -83,7 +83,7 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
     if let Some(shared) = shared(&slot) {
         return Ok(shared);
     }
-    let me = Peer::new(&endpoint.name, endpoint.incarnation.as_u64())?;
+    let me = LockPeer::new(&endpoint.name, endpoint.incarnation.as_u64())?;
     let runtime = &endpoint.domain.inner.service.runtime;
     let timer = Timer::new(runtime).map_err(LockError::Timer)?;
     let (kind, mut options) = slot.options.unwrap_or_default();
@@ -136,7 +136,7 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
 }
 
 /// Has the agents of this membership that use locks know each other.
-fn meet_neighbors(core: &Arc<AgentCore>, me: &Peer, shared: &Shared) {
+fn meet_neighbors(core: &Arc<AgentCore>, me: &LockPeer, shared: &Shared) {
     let this = Arc::downgrade(core);
     for other in core.endpoint.domain.inner.locking.add(this) {
         let Ok(other) = other.downcast::<AgentCore>() else {
@@ -174,11 +174,11 @@ pub(super) struct Shared {
 
 struct State {
     core: Locks<AnyAlgorithm>,
-    outbox: VecDeque<(Peer, LockMessage)>,
+    outbox: VecDeque<(LockPeer, LockMessage)>,
     claims: HashMap<ClaimId, watch::Sender<ClaimState>>,
     owned: HashMap<Resource, OwnedState>,
     /// Members that the task does not watch yet.
-    joined: Vec<Peer>,
+    joined: Vec<LockPeer>,
     /// Time at which the timer of the task expires. It is not after the next timeout of the core. A timeout
     /// that moves to a later time leaves the timer as it is: most timeouts are those of letters that are
     /// answered at once, and each change would wake the task.
@@ -362,7 +362,7 @@ impl Shared {
         }
     }
 
-    fn send(&self, core: &AgentCore, to: &Peer, message: &LockMessage) {
+    fn send(&self, core: &AgentCore, to: &LockPeer, message: &LockMessage) {
         let endpoint = &core.endpoint;
         let message_kind = message.algorithm.unwrap_or(self.kind);
         let sent = AgentId::new(to.name())
@@ -387,7 +387,7 @@ impl Shared {
     }
 
     /// Makes an agent of this library a member.
-    fn meet(&self, core: &AgentCore, peer: &Peer) {
+    fn meet(&self, core: &AgentCore, peer: &LockPeer) {
         self.act(core, |state, now, actions| {
             state.core.join(now, peer, LockDialect::Own, actions);
             state.note(peer);
@@ -398,7 +398,7 @@ impl Shared {
     pub(super) fn claim(
         &self,
         core: &AgentCore,
-        owners: &[(Resource, Peer, Option<Algorithm>)],
+        owners: &[(Resource, LockPeer, Option<Algorithm>)],
         begin: impl FnOnce(&mut Locks<AnyAlgorithm>, Millis, &mut Vec<Action>) -> ClaimId,
     ) -> (ClaimId, watch::Receiver<ClaimState>) {
         self.act(core, |state, now, actions| {
@@ -514,7 +514,13 @@ impl Shared {
     }
 
     /// Records a fence that a device of this agent has admitted, or tells it its owner.
-    pub(super) fn saw(&self, core: &AgentCore, owner: Option<&Peer>, fence: &Fence, tell: bool) {
+    pub(super) fn saw(
+        &self,
+        core: &AgentCore,
+        owner: Option<&LockPeer>,
+        fence: &Fence,
+        tell: bool,
+    ) {
         self.act(core, |state, now, actions| {
             if let (Some(owner), Ok(resource)) = (owner, Resource::new(fence.resource())) {
                 state
@@ -588,7 +594,7 @@ impl Shared {
 
 impl State {
     /// Has the task watch a member.
-    fn note(&mut self, peer: &Peer) {
+    fn note(&mut self, peer: &LockPeer) {
         if self.core.is_member(peer) {
             self.joined.push(peer.clone());
         }
@@ -604,7 +610,7 @@ struct Task {
     changes: Option<Watch>,
     partners: PartnerWatch,
     /// The members that `partners` watches.
-    watched: HashSet<Peer>,
+    watched: HashSet<LockPeer>,
     greetings: Greetings,
     greets_legacy_peers: bool,
     timer: Timer,
@@ -728,12 +734,12 @@ impl Task {
     }
 
     /// Returns the sender of a message, as far as its connection proves it.
-    fn sender(&self, incoming: &Incoming) -> Option<Peer> {
+    fn sender(&self, incoming: &Incoming) -> Option<LockPeer> {
         let name = incoming.message().sender()?.name();
         let directory = self.core.endpoint.domain.directory();
         let registration = match incoming.sender {
             proved if proved.is_known() => {
-                let peer = Peer::new(name, proved.as_u64()).ok()?;
+                let peer = LockPeer::new(name, proved.as_u64()).ok()?;
                 let Some(entry) = incoming.registered(directory) else {
                     // The entry of a member may have left before its last messages arrive.
                     let is_free = directory.known_incarnation(proved).is_none();
@@ -751,15 +757,15 @@ impl Task {
             _ if incoming.via.is_none() => directory.lookup(name)?.incarnation,
             _ => legacy(directory, name)?,
         };
-        Peer::new(name, registration.as_u64()).ok()
+        LockPeer::new(name, registration.as_u64()).ok()
     }
 
     /// Handles the proof that an agent has left or died.
     fn departed(&mut self, agent: &str) {
         let entry = self.core.endpoint.domain.directory().lookup(agent);
         let present = entry.map(|entry| entry.incarnation.as_u64());
-        let gone = |peer: &&Peer| peer.name() == agent && Some(peer.registration()) != present;
-        let gone: Vec<Peer> = self.watched.iter().filter(gone).cloned().collect();
+        let gone = |peer: &&LockPeer| peer.name() == agent && Some(peer.registration()) != present;
+        let gone: Vec<LockPeer> = self.watched.iter().filter(gone).cloned().collect();
         for peer in gone {
             self.watched.remove(&peer);
             self.shared.act(&self.core, |state, now, actions| {
@@ -792,7 +798,7 @@ impl Task {
     /// Greets the agents in the directory that were not greeted, and forgets those that are not in it.
     fn greet_all(&mut self) {
         let entries = self.core.endpoint.domain.directory().entries();
-        let present: HashSet<Peer> = entries.iter().filter_map(|it| peer_of(it)).collect();
+        let present: HashSet<LockPeer> = entries.iter().filter_map(|it| peer_of(it)).collect();
         self.greetings.retain(|agent| present.contains(agent));
         for entry in entries.iter() {
             self.greet(entry);
@@ -829,7 +835,7 @@ impl Task {
     }
 
     /// Asks an agent for a sign of life.
-    fn ask(&self, agent: Peer) {
+    fn ask(&self, agent: LockPeer) {
         self.shared.act(&self.core, |state, now, actions| {
             state.core.probe(now, agent, actions);
         });
@@ -854,8 +860,8 @@ async fn store(runtime: &Handle, file: &Weak<Mutex<StateFile>>, epoch: u64) -> b
 }
 
 /// Returns an agent in its registration, which is unknown for a legacy peer.
-fn peer_of(entry: &Entry) -> Option<Peer> {
-    Peer::new(&entry.name, entry.incarnation.as_u64()).ok()
+fn peer_of(entry: &Entry) -> Option<LockPeer> {
+    LockPeer::new(&entry.name, entry.incarnation.as_u64()).ok()
 }
 
 /// Waits until this time, without end if there is none.

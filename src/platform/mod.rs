@@ -42,8 +42,8 @@ use std::time::Duration;
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 use fipa_content::PrintError;
 pub use fipa_platform::{
-    AgentDescription, AmsDescription, AnswerError, ApDescription, Constraints, Exception, ONTOLOGY,
-    Property, ServiceDescription, State, limits,
+    AgentDescription, AgentState, AmsDescription, AnswerError, ApDescription, Constraints,
+    Exception, ONTOLOGY, Property, ServiceDescription, limits,
 };
 use fipa_platform::{Function, found, registered, subscription};
 use fipa_sds::{Entry, Reach};

@@ -9,7 +9,7 @@ use fipa_acl::{
     escape_name,
 };
 use fipa_monitor::{
-    Header, Library, Monitor, Policy, Unchecked, Verdict, Violation, ViolationKind,
+    Header, Library, Monitor, MonitorPolicy, Unchecked, Verdict, Violation, ViolationKind,
 };
 use fipa_mts::{DeliveryFailure, letter_for};
 use fipa_transport::{FailureReason, Incarnation, Outcome, log_limit};
@@ -570,7 +570,7 @@ impl Speaker {
     fn new(core: &Arc<AgentCore>, protocol: &str, id: String) -> Self {
         let library = Arc::clone(core.endpoint.domain.inner.rules.library());
         // The conversation begins here, so that no message continues an earlier one.
-        let mut policy = Policy::default();
+        let mut policy = MonitorPolicy::default();
         policy.unsolicited = true;
         Self {
             monitor: Monitor::agent(library, &core.endpoint.name)

@@ -16,7 +16,7 @@ use fipa_transport::{Incarnation, Location, Transport};
 #[cfg(feature = "secure")]
 pub(crate) use fipa_transport_net::secure::Security;
 use fipa_transport_net::{
-    Counters, Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UdpTransport,
+    Counters, Identity, NetLimits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UdpTransport,
     UnixConfig, UnixTransport,
 };
 #[cfg(feature = "quic")]
@@ -122,7 +122,7 @@ impl TestService {
         security: Option<Security>,
         bounds: Bounds,
     ) -> Self {
-        let mut limits = Limits::default();
+        let mut limits = NetLimits::default();
         if security.is_some() {
             // Tests cut the links to such services, which must be detected soon.
             limits.keep_alive = Duration::from_millis(500);
@@ -193,7 +193,10 @@ impl TestService {
             #[cfg(feature = "quic")]
             quic.clone().map(|it| it as Arc<dyn Transport>),
         ];
-        let directory = Arc::new(MemoryDirectory::new(fipa_sds::MtsId::new(name, incarnation)));
+        let directory = Arc::new(MemoryDirectory::new(fipa_sds::MtsId::new(
+            name,
+            incarnation,
+        )));
         let core = CoreConfig {
             forwards,
             ..CoreConfig::new(name, incarnation, order.to_vec())

@@ -68,7 +68,7 @@ pub use quic::{QuicConfig, QuicTransport};
 #[cfg(feature = "ip")]
 pub use refusals::{Refusal, Refusals};
 pub use refused_dials::{RefusedDial, RefusedDials};
-pub use stream::config::Limits;
+pub use stream::config::NetLimits;
 pub use stream::counters::Counters;
 #[cfg(feature = "ip")]
 pub use tcp::{TcpConfig, TcpTransport};

@@ -6,7 +6,7 @@ use std::net::SocketAddr;
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::stream::config::Limits;
+use crate::stream::config::NetLimits;
 
 /// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
 /// while this process is stopped.
@@ -38,7 +38,7 @@ fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
 }
 
 /// Sets the options of a connected socket.
-pub(crate) fn prepare(stream: &TcpStream, limits: &Limits) -> io::Result<()> {
+pub(crate) fn prepare(stream: &TcpStream, limits: &NetLimits) -> io::Result<()> {
     stream.set_nodelay(true)?;
     // Bounds the time without an acknowledgment of the peer's host, for example after a cable was
     // unplugged.

@@ -17,7 +17,7 @@ use fipa_testbed::{frame_header, until_some};
 use fipa_transport::{
     Conclusion, Kind, Location, Parcel, Reaction, Transport as _, TransportErrorKind,
 };
-use fipa_transport_net::{Counters, Limits};
+use fipa_transport_net::{Counters, NetLimits};
 use socket2::{Domain, Socket, Type};
 
 /// A recorded letter of a fipa_services peer.
@@ -191,7 +191,7 @@ fn a_letter_of_a_legacy_peer_is_bounded() {
 #[test]
 fn a_thousand_silent_connections_hold_few_descriptors_and_block_no_peer() {
     let party = Party::new();
-    let max = Limits::default().max_strangers as u64;
+    let max = NetLimits::default().max_strangers as u64;
     let mut streams: Vec<TcpStream> = Vec::new();
     for _ in 0..1000 {
         streams.push(connect(&party));

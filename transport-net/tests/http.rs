@@ -21,7 +21,7 @@ use fipa_testbed::until_some;
 use fipa_transport::{
     Answer, Conclusion, FailureReason, Kind, Location, Parcel, Transport as _, TransportErrorKind,
 };
-use fipa_transport_net::{HttpConfig, HttpTransport, Limits};
+use fipa_transport_net::{HttpConfig, HttpTransport, NetLimits};
 
 const STRING: &[u8] = include_bytes!("data/jade_http/string.3-echo-reply-from-jade.bin");
 const XML: &[u8] = include_bytes!("data/jade_http/xml.3-echo-reply-from-jade.bin");
@@ -37,7 +37,7 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 
 type Platform = Party<HttpTransport>;
 
-fn with(limits: Limits) -> Platform {
+fn with(limits: NetLimits) -> Platform {
     let tcp = config(&["127.0.0.1:0"]);
     let config = HttpConfig {
         listen: tcp.listen,
@@ -176,7 +176,7 @@ fn equal_letters_on_connections_of_their_own_all_arrive() {
 
 #[test]
 fn other_requests_are_answered_with_their_status_and_end_the_connection() {
-    let party = with(Limits {
+    let party = with(NetLimits {
         max_letter: 100_000,
         handshake_timeout: Duration::from_millis(500),
         ..config(&[]).limits
@@ -233,7 +233,7 @@ fn other_requests_are_answered_with_their_status_and_end_the_connection() {
 
 #[test]
 fn a_body_that_stops_is_given_up() {
-    let party = with(Limits {
+    let party = with(NetLimits {
         stall_timeout: Duration::from_millis(300),
         ..config(&[]).limits
     });
@@ -246,7 +246,7 @@ fn a_body_that_stops_is_given_up() {
 
 #[test]
 fn idle_connections_give_way_and_busy_ones_do_not() {
-    let party = with(Limits {
+    let party = with(NetLimits {
         max_connections: 4,
         ..config(&[]).limits
     });
@@ -491,7 +491,7 @@ fn an_answer_other_than_200_is_a_failed_attempt() {
 
 #[test]
 fn a_letter_without_an_answer_is_unconfirmed_and_never_repeated() {
-    let party = with(Limits {
+    let party = with(NetLimits {
         stall_timeout: Duration::from_millis(300),
         ..config(&[]).limits
     });

@@ -19,7 +19,7 @@ use fipa_testbed::until_some;
 use fipa_transport::{
     Answer, Arrival, AttemptId, Conclusion, Kind, LegacySource, Reaction, Sink, Transport as _,
 };
-use fipa_transport_net::{Limits, TcpTransport};
+use fipa_transport_net::{NetLimits, TcpTransport};
 use parking_lot::{Condvar, Mutex};
 use socket2::{Domain, Socket, Type};
 
@@ -245,7 +245,7 @@ fn inside_beyond_the_bounds_the_newest_connection_is_reset_and_its_sender_sees_i
     at_both_addresses();
     let gateway = Gateway::new();
     gateway.sink.hold();
-    let limits = Limits::default();
+    let limits = NetLimits::default();
     let room = (limits.max_reads_per_address + limits.max_unread_per_address) as u64;
     assert_eq!(room, 32 + 512);
     for number in 0..room {

@@ -22,7 +22,7 @@ use fipa_transport::{
     Answer, Conclusion, FailureReason, Kind, Location, Mandate, Transport, TransportErrorKind,
 };
 use fipa_transport_net::secure::{Rules, Security};
-use fipa_transport_net::{Counters, Limits, TcpTransport};
+use fipa_transport_net::{Counters, NetLimits, TcpTransport};
 
 /// A transport over which peers prove their identity.
 trait Proving: Transport + Sized {
@@ -30,13 +30,13 @@ trait Proving: Transport + Sized {
         Self::limited(security, |_| {})
     }
 
-    fn limited(security: Security, limit: fn(&mut Limits)) -> Party<Self>;
+    fn limited(security: Security, limit: fn(&mut NetLimits)) -> Party<Self>;
 
     fn counters(&self) -> Counters;
 }
 
 impl Proving for TcpTransport {
-    fn limited(security: Security, limit: fn(&mut Limits)) -> Party {
+    fn limited(security: Security, limit: fn(&mut NetLimits)) -> Party {
         let mut config = config(&["127.0.0.1:0"]);
         config.security = Some(security);
         limit(&mut config.limits);
@@ -50,7 +50,7 @@ impl Proving for TcpTransport {
 
 #[cfg(feature = "quic")]
 impl Proving for fipa_transport_net::QuicTransport {
-    fn limited(security: Security, limit: fn(&mut Limits)) -> Party<Self> {
+    fn limited(security: Security, limit: fn(&mut NetLimits)) -> Party<Self> {
         let mut config = common::quic_config(&["127.0.0.1:0"], security);
         limit(&mut config.limits);
         Party::over(common::Recorder::default(), |runtime| {
@@ -530,7 +530,7 @@ fn connections_of_a_local_user_do_not_keep_out_peers_with_keys() {
         ..Rules::default()
     };
     let security = Security::new(crex.credentials(&[&rover]), rules).unwrap();
-    let limits = Limits {
+    let limits = NetLimits {
         max_connections: 32,
         max_strangers: 8,
         max_reads_per_address: 8,

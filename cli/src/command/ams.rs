@@ -1,7 +1,7 @@
 //! `fipa ams`: lists the agents of a platform.
 
 use clap::Args;
-use fipa::platform::{Ams, AmsDescription, ApDescription, State};
+use fipa::platform::{Ams, AmsDescription, ApDescription, AgentState};
 use fipa::{Agent, AgentId, Config};
 use fipa_acl::escape;
 use serde_json::{Value, json};
@@ -47,15 +47,15 @@ pub(crate) struct Arguments {
 
     /// Only agents in this state: initiated, active, suspended, waiting or transit
     #[arg(long, value_name = "STATE", value_parser = state)]
-    state: Option<State>,
+    state: Option<AgentState>,
 
     /// Print JSON
     #[arg(long)]
     json: bool,
 }
 
-fn state(text: &str) -> Result<State, String> {
-    let state = State::of(text);
+fn state(text: &str) -> Result<AgentState, String> {
+    let state = AgentState::of(text);
     state.ok_or_else(|| "expected initiated, active, suspended, waiting or transit".to_owned())
 }
 
@@ -134,7 +134,7 @@ impl Listed {
         }
         let mut table = output::table(["AGENT", "STATE", "OWNER"]);
         table.add_rows(agents.iter().map(|agent| {
-            let state = agent.state.map(State::as_str);
+            let state = agent.state.map(AgentState::as_str);
             [
                 escape(&name(agent)).into_owned(),
                 state.unwrap_or("-").to_owned(),
@@ -158,7 +158,7 @@ fn value(ams: &AgentId, platform: &ApDescription, agents: &[AmsDescription]) -> 
         json!({
             "name": name(agent),
             "ownership": agent.ownership,
-            "state": agent.state.map(State::as_str),
+            "state": agent.state.map(AgentState::as_str),
         })
     });
     json!({

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 use comfy_table::Table;
-use fipa::admin::routes::{Connected, Report, Route, RouteState, Standing};
+use fipa::admin::routes::{Connected, RouteReport, Route, RouteState, Standing};
 use fipa::{Matcher, Query};
 use fipa_acl::{escape, escape_name};
 use serde_json::json;
@@ -106,7 +106,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     output::text(&described(&process, gateway.as_ref()))
 }
 
-fn described(process: &Report, gateway: Option<&Report>) -> String {
+fn described(process: &RouteReport, gateway: Option<&RouteReport>) -> String {
     let mut text = String::new();
     let mut table = output::table(["TO", "FROM", "ROUTE", "STATUS"]);
     for route in &process.routes {
@@ -125,7 +125,7 @@ fn described(process: &Report, gateway: Option<&Report>) -> String {
     text
 }
 
-fn gateway_described(gateway: &Report) -> String {
+fn gateway_described(gateway: &RouteReport) -> String {
     let locations: Vec<String> = gateway.locations.iter().map(ToString::to_string).collect();
     let mut text = format!("\nGateway {}:\n", escape_name(&gateway.mts));
     text.push_str(&format!("listening on {}\n", locations.join(", ")));

@@ -13,7 +13,7 @@ pub use ricart_agrawala::RicartAgrawala;
 pub use suzuki_kasami::SuzukiKasami;
 
 use crate::faults::Fault;
-use crate::{Act, Conversation, LockDialect, Millis, Peer};
+use crate::{Act, Conversation, LockDialect, LockPeer, Millis};
 
 /// The algorithms. All agents that use a resource use the one that its owner names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
@@ -137,9 +137,9 @@ pub struct Context<'a> {
     /// The current time.
     pub now: Millis,
     /// The other members.
-    pub members: &'a BTreeMap<Peer, Member>,
+    pub members: &'a BTreeMap<LockPeer, Member>,
     /// Owner of the resource, if it is known.
-    pub owner: Option<&'a Peer>,
+    pub owner: Option<&'a LockPeer>,
     /// Agents that this agent lets pass.
     pub gate: Gate,
     /// Lease of a grant.
@@ -152,7 +152,7 @@ pub struct Context<'a> {
 }
 
 impl Context<'_> {
-    fn dialect(&self, peer: &Peer) -> LockDialect {
+    fn dialect(&self, peer: &LockPeer) -> LockDialect {
         self.members
             .get(peer)
             .map_or(LockDialect::Legacy, |member| member.dialect)
@@ -160,7 +160,7 @@ impl Context<'_> {
 
     /// Whether a request to an agent is repeated. Agents of `distributed_locking` treat a second request
     /// in a conversation as an error; their letters are not lost while they run.
-    fn accepts_repetition(&self, peer: &Peer) -> bool {
+    fn accepts_repetition(&self, peer: &LockPeer) -> bool {
         self.dialect(peer) == LockDialect::Own
     }
 }
@@ -175,7 +175,7 @@ pub enum Step {
     /// Send a message.
     Send {
         /// The receiver.
-        to: Peer,
+        to: LockPeer,
         /// The conversation.
         conversation: Conversation,
         /// The act.
@@ -194,7 +194,7 @@ pub trait MutualExclusion: Clone + Eq + Hash + fmt::Debug {
     /// Creates the state of an agent that has neither sent nor received a message.
     ///
     /// `owns` is whether the agent owns the resource: it then has the token.
-    fn new(kind: Algorithm, me: Peer, owns: bool) -> Self;
+    fn new(kind: Algorithm, me: LockPeer, owns: bool) -> Self;
 
     /// Begins a request.
     fn request(&mut self, context: &Context<'_>, conversation: &Conversation, out: &mut Vec<Step>);
@@ -206,7 +206,7 @@ pub trait MutualExclusion: Clone + Eq + Hash + fmt::Debug {
     fn handle(
         &mut self,
         context: &Context<'_>,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         act: &Act,
         out: &mut Vec<Step>,
@@ -216,7 +216,7 @@ pub trait MutualExclusion: Clone + Eq + Hash + fmt::Debug {
     fn gate_changed(&mut self, context: &Context<'_>, out: &mut Vec<Step>);
 
     /// At the owner: the grant to `holder` has ended. [`gate_changed`](Self::gate_changed) follows.
-    fn grant_ended(&mut self, holder: &Peer);
+    fn grant_ended(&mut self, holder: &LockPeer);
 
     /// This agent begins to own the resource.
     fn own(&mut self, context: &Context<'_>, out: &mut Vec<Step>);
@@ -225,10 +225,10 @@ pub trait MutualExclusion: Clone + Eq + Hash + fmt::Debug {
     fn owner_changed(&mut self);
 
     /// An agent joins the group. It is a member already.
-    fn joined(&mut self, context: &Context<'_>, peer: &Peer, out: &mut Vec<Step>);
+    fn joined(&mut self, context: &Context<'_>, peer: &LockPeer, out: &mut Vec<Step>);
 
     /// An agent is left out: it left or crashed (`gone`), or it does not answer.
-    fn lost(&mut self, context: &Context<'_>, peer: &Peer, gone: bool, out: &mut Vec<Step>);
+    fn lost(&mut self, context: &Context<'_>, peer: &LockPeer, gone: bool, out: &mut Vec<Step>);
 
     /// Repeats the open request. Basic algorithms repeat nothing.
     fn repeat(&mut self, context: &Context<'_>, out: &mut Vec<Step>);
@@ -243,7 +243,7 @@ pub trait MutualExclusion: Clone + Eq + Hash + fmt::Debug {
     fn has_entered(&self) -> bool;
 
     /// Members that this agent waits for. The extended algorithms need them probed.
-    fn awaited(&self) -> BTreeSet<Peer>;
+    fn awaited(&self) -> BTreeSet<LockPeer>;
 
     /// Estimate of the number of agents that enter before this one.
     fn ahead(&self) -> usize;
@@ -285,7 +285,7 @@ macro_rules! either {
 }
 
 impl MutualExclusion for AnyAlgorithm {
-    fn new(kind: Algorithm, me: Peer, owns: bool) -> Self {
+    fn new(kind: Algorithm, me: LockPeer, owns: bool) -> Self {
         match kind {
             Algorithm::OwnerQueue => Self::OwnerQueue(OwnerQueue::new(kind, me, owns)),
             Algorithm::SuzukiKasami | Algorithm::SuzukiKasamiExtended => {
@@ -308,7 +308,7 @@ impl MutualExclusion for AnyAlgorithm {
     fn handle(
         &mut self,
         context: &Context<'_>,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         act: &Act,
         out: &mut Vec<Step>,
@@ -320,7 +320,7 @@ impl MutualExclusion for AnyAlgorithm {
         either!(self, algorithm => algorithm.gate_changed(context, out));
     }
 
-    fn grant_ended(&mut self, holder: &Peer) {
+    fn grant_ended(&mut self, holder: &LockPeer) {
         either!(self, algorithm => algorithm.grant_ended(holder));
     }
 
@@ -332,11 +332,11 @@ impl MutualExclusion for AnyAlgorithm {
         either!(self, algorithm => algorithm.owner_changed());
     }
 
-    fn joined(&mut self, context: &Context<'_>, peer: &Peer, out: &mut Vec<Step>) {
+    fn joined(&mut self, context: &Context<'_>, peer: &LockPeer, out: &mut Vec<Step>) {
         either!(self, algorithm => algorithm.joined(context, peer, out));
     }
 
-    fn lost(&mut self, context: &Context<'_>, peer: &Peer, gone: bool, out: &mut Vec<Step>) {
+    fn lost(&mut self, context: &Context<'_>, peer: &LockPeer, gone: bool, out: &mut Vec<Step>) {
         either!(self, algorithm => algorithm.lost(context, peer, gone, out));
     }
 
@@ -356,7 +356,7 @@ impl MutualExclusion for AnyAlgorithm {
         either!(self, algorithm => algorithm.has_entered())
     }
 
-    fn awaited(&self) -> BTreeSet<Peer> {
+    fn awaited(&self) -> BTreeSet<LockPeer> {
         either!(self, algorithm => algorithm.awaited())
     }
 

@@ -6,7 +6,7 @@
 use std::collections::BTreeSet;
 
 use super::{Algorithm, Context, MutualExclusion, Step};
-use crate::{Act, Conversation, Millis, Peer};
+use crate::{Act, Conversation, LockPeer, Millis};
 
 /// State of one agent for one resource.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -16,7 +16,7 @@ pub struct OwnerQueue {
 }
 
 impl MutualExclusion for OwnerQueue {
-    fn new(_: Algorithm, _: Peer, _: bool) -> Self {
+    fn new(_: Algorithm, _: LockPeer, _: bool) -> Self {
         Self {
             own: None,
             place: None,
@@ -38,7 +38,7 @@ impl MutualExclusion for OwnerQueue {
     fn handle(
         &mut self,
         context: &Context<'_>,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         act: &Act,
         _: &mut Vec<Step>,
@@ -53,15 +53,15 @@ impl MutualExclusion for OwnerQueue {
 
     fn gate_changed(&mut self, _: &Context<'_>, _: &mut Vec<Step>) {}
 
-    fn grant_ended(&mut self, _: &Peer) {}
+    fn grant_ended(&mut self, _: &LockPeer) {}
 
     fn own(&mut self, _: &Context<'_>, _: &mut Vec<Step>) {}
 
     fn owner_changed(&mut self) {}
 
-    fn joined(&mut self, _: &Context<'_>, _: &Peer, _: &mut Vec<Step>) {}
+    fn joined(&mut self, _: &Context<'_>, _: &LockPeer, _: &mut Vec<Step>) {}
 
-    fn lost(&mut self, _: &Context<'_>, _: &Peer, _: bool, _: &mut Vec<Step>) {}
+    fn lost(&mut self, _: &Context<'_>, _: &LockPeer, _: bool, _: &mut Vec<Step>) {}
 
     /// The holder repeats the request itself.
     fn repeat(&mut self, _: &Context<'_>, _: &mut Vec<Step>) {}
@@ -76,7 +76,7 @@ impl MutualExclusion for OwnerQueue {
         self.own.is_some()
     }
 
-    fn awaited(&self) -> BTreeSet<Peer> {
+    fn awaited(&self) -> BTreeSet<LockPeer> {
         BTreeSet::new()
     }
 

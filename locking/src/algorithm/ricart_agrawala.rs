@@ -15,7 +15,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::{Algorithm, Context, MutualExclusion, Step};
 use crate::faults::fault;
-use crate::{Act, Conversation, Gate, LockDialect, Millis, Peer};
+use crate::{Act, Conversation, Gate, LockDialect, LockPeer, Millis};
 
 /// Maximum clock: `distributed_locking` reads a 32-bit integer. Clocks that have reached it are equal,
 /// and the order is that of the agents.
@@ -24,14 +24,14 @@ const MAX_CLOCK: u64 = i32::MAX as u64;
 /// State of one agent for one resource.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct RicartAgrawala {
-    me: Peer,
+    me: LockPeer,
     extended: bool,
     /// Highest clock that was sent or received.
     clock: u64,
     own: Option<OwnRequest>,
-    deferred: BTreeMap<Peer, Deferred>,
+    deferred: BTreeMap<LockPeer, Deferred>,
     /// Members of `distributed_locking` that have asked this agent, or were asked again.
-    acquainted: BTreeSet<Peer>,
+    acquainted: BTreeSet<LockPeer>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -39,7 +39,7 @@ struct OwnRequest {
     conversation: Conversation,
     clock: u64,
     /// Members that have not agreed. The request has entered when there are none.
-    awaited: BTreeSet<Peer>,
+    awaited: BTreeSet<LockPeer>,
     entered: bool,
 }
 
@@ -51,7 +51,7 @@ struct Deferred {
 
 impl RicartAgrawala {
     /// Whether the request of this agent precedes that of `peer`.
-    fn precedes(&self, peer: &Peer, clock: u64) -> bool {
+    fn precedes(&self, peer: &LockPeer, clock: u64) -> bool {
         self.own
             .as_ref()
             .is_some_and(|own| own.entered || (own.clock, &self.me) < (clock, peer))
@@ -73,7 +73,7 @@ impl RicartAgrawala {
 
     /// Whether the agent that agrees may have an open request later than that of this agent, without having asked
     /// this agent.
-    fn may_be_a_rival(&self, context: &Context<'_>, from: &Peer, clock: u64) -> bool {
+    fn may_be_a_rival(&self, context: &Context<'_>, from: &LockPeer, clock: u64) -> bool {
         let own = self.own.as_ref();
         // An agent of `distributed_locking` agrees with the higher one of both clocks and 2. Of two requests with
         // the same clock, that of the lower agent is earlier.
@@ -89,7 +89,7 @@ impl RicartAgrawala {
             && !fault!(context.fault, TrustStranger)
     }
 
-    fn agree(&self, to: Peer, conversation: Conversation) -> Step {
+    fn agree(&self, to: LockPeer, conversation: Conversation) -> Step {
         let clock = self.clock;
         Step::Send {
             to,
@@ -98,7 +98,7 @@ impl RicartAgrawala {
         }
     }
 
-    fn ask(own: &OwnRequest, to: &Peer) -> Step {
+    fn ask(own: &OwnRequest, to: &LockPeer) -> Step {
         Step::Send {
             to: to.clone(),
             conversation: own.conversation.clone(),
@@ -106,7 +106,7 @@ impl RicartAgrawala {
         }
     }
 
-    fn no_longer_awaited(&mut self, peer: &Peer, out: &mut Vec<Step>) {
+    fn no_longer_awaited(&mut self, peer: &LockPeer, out: &mut Vec<Step>) {
         if let Some(own) = &mut self.own
             && own.awaited.remove(peer)
             && own.awaited.is_empty()
@@ -119,7 +119,7 @@ impl RicartAgrawala {
 }
 
 impl MutualExclusion for RicartAgrawala {
-    fn new(kind: Algorithm, me: Peer, _: bool) -> Self {
+    fn new(kind: Algorithm, me: LockPeer, _: bool) -> Self {
         Self {
             me,
             extended: kind.is_extended(),
@@ -161,7 +161,7 @@ impl MutualExclusion for RicartAgrawala {
     fn handle(
         &mut self,
         context: &Context<'_>,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         act: &Act,
         out: &mut Vec<Step>,
@@ -220,13 +220,13 @@ impl MutualExclusion for RicartAgrawala {
         }
     }
 
-    fn grant_ended(&mut self, _: &Peer) {}
+    fn grant_ended(&mut self, _: &LockPeer) {}
 
     fn own(&mut self, _: &Context<'_>, _: &mut Vec<Step>) {}
 
     fn owner_changed(&mut self) {}
 
-    fn joined(&mut self, context: &Context<'_>, peer: &Peer, out: &mut Vec<Step>) {
+    fn joined(&mut self, context: &Context<'_>, peer: &LockPeer, out: &mut Vec<Step>) {
         if let Some(own) = &mut self.own
             && (self.extended || !fault!(context.fault, AskNoNewcomer))
             && !fault!(context.fault, Foreign)
@@ -237,7 +237,7 @@ impl MutualExclusion for RicartAgrawala {
         }
     }
 
-    fn lost(&mut self, _: &Context<'_>, peer: &Peer, gone: bool, out: &mut Vec<Step>) {
+    fn lost(&mut self, _: &Context<'_>, peer: &LockPeer, gone: bool, out: &mut Vec<Step>) {
         if gone {
             self.deferred.remove(peer);
             self.acquainted.remove(peer);
@@ -251,7 +251,7 @@ impl MutualExclusion for RicartAgrawala {
         if let Some(own) = &self.own
             && self.extended
         {
-            let repeatable = |peer: &&Peer| context.accepts_repetition(peer);
+            let repeatable = |peer: &&LockPeer| context.accepts_repetition(peer);
             let awaited = own.awaited.iter().filter(repeatable);
             out.extend(awaited.map(|peer| Self::ask(own, peer)));
         }
@@ -267,7 +267,7 @@ impl MutualExclusion for RicartAgrawala {
         self.own.as_ref().is_some_and(|own| own.entered)
     }
 
-    fn awaited(&self) -> BTreeSet<Peer> {
+    fn awaited(&self) -> BTreeSet<LockPeer> {
         match &self.own {
             Some(own) if self.extended => own.awaited.clone(),
             _ => BTreeSet::new(),

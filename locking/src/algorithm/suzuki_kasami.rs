@@ -21,7 +21,7 @@ use std::sync::Arc;
 
 use super::{Algorithm, Context, MutualExclusion, Step};
 use crate::faults::fault;
-use crate::{Act, Conversation, Gate, LockDialect, Millis, Peer, Token};
+use crate::{Act, Conversation, Gate, LockDialect, LockPeer, Millis, Token};
 
 /// Maximum number of a request: `distributed_locking` reads a 32-bit integer.
 const MAX_NUMBER: u64 = i32::MAX as u64;
@@ -29,7 +29,7 @@ const MAX_NUMBER: u64 = i32::MAX as u64;
 /// State of one agent for one resource.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct SuzukiKasami {
-    me: Peer,
+    me: LockPeer,
     extended: bool,
     /// Latest request of each other agent, by name, as in the token.
     requests: BTreeMap<Arc<str>, Request>,
@@ -57,7 +57,7 @@ pub struct SuzukiKasami {
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Request {
-    peer: Peer,
+    peer: LockPeer,
     number: u64,
     conversation: Conversation,
 }
@@ -70,7 +70,7 @@ struct OwnRequest {
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Away {
-    to: Peer,
+    to: LockPeer,
     /// Number of the request that the token was sent for.
     number: u64,
     /// The token as it was sent.
@@ -89,7 +89,7 @@ impl SuzukiKasami {
         context.owner == Some(&self.me)
     }
 
-    fn ask(&self, own: &OwnRequest, to: &Peer) -> Step {
+    fn ask(&self, own: &OwnRequest, to: &LockPeer) -> Step {
         Step::Send {
             to: to.clone(),
             conversation: own.conversation.clone(),
@@ -108,7 +108,7 @@ impl SuzukiKasami {
         }
     }
 
-    fn record(&mut self, from: &Peer, number: u64, conversation: &Conversation) -> bool {
+    fn record(&mut self, from: &LockPeer, number: u64, conversation: &Conversation) -> bool {
         let name = from.shared_name();
         let known = self.requests.get(name);
         let restarted = known.is_some_and(|known| known.peer != *from);
@@ -200,7 +200,7 @@ impl SuzukiKasami {
     fn serve_again(
         &mut self,
         context: &Context<'_>,
-        from: &Peer,
+        from: &LockPeer,
         number: u64,
         out: &mut Vec<Step>,
     ) {
@@ -236,7 +236,7 @@ impl SuzukiKasami {
     fn send_token(
         &mut self,
         context: &Context<'_>,
-        to: Peer,
+        to: LockPeer,
         conversation: Option<Conversation>,
         out: &mut Vec<Step>,
     ) {
@@ -244,7 +244,7 @@ impl SuzukiKasami {
             return;
         };
         token.generation = Some(self.generation);
-        let legacy = |peer: &Peer| context.dialect(peer) == LockDialect::Legacy;
+        let legacy = |peer: &LockPeer| context.dialect(peer) == LockDialect::Legacy;
         let archive = context.members.keys().any(legacy) || legacy(&to);
         token.archive = archive.then(|| self.archive.unwrap_or(Token::ARCHIVE));
         let request = self.requests.get(to.shared_name());
@@ -304,7 +304,7 @@ impl SuzukiKasami {
     fn take(
         &mut self,
         context: &Context<'_>,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         token: &Token,
         out: &mut Vec<Step>,
@@ -372,7 +372,7 @@ impl Token {
 }
 
 impl MutualExclusion for SuzukiKasami {
-    fn new(kind: Algorithm, me: Peer, owns: bool) -> Self {
+    fn new(kind: Algorithm, me: LockPeer, owns: bool) -> Self {
         Self {
             me,
             extended: kind.is_extended(),
@@ -419,7 +419,7 @@ impl MutualExclusion for SuzukiKasami {
     fn handle(
         &mut self,
         context: &Context<'_>,
-        from: &Peer,
+        from: &LockPeer,
         conversation: &Conversation,
         act: &Act,
         out: &mut Vec<Step>,
@@ -444,7 +444,7 @@ impl MutualExclusion for SuzukiKasami {
         }
     }
 
-    fn grant_ended(&mut self, holder: &Peer) {
+    fn grant_ended(&mut self, holder: &LockPeer) {
         if let Some(away) = &mut self.away
             && away.to == *holder
         {
@@ -466,7 +466,7 @@ impl MutualExclusion for SuzukiKasami {
         }
     }
 
-    fn joined(&mut self, _: &Context<'_>, peer: &Peer, out: &mut Vec<Step>) {
+    fn joined(&mut self, _: &Context<'_>, peer: &LockPeer, out: &mut Vec<Step>) {
         if let Some(own) = &self.own
             && !own.entered
         {
@@ -474,7 +474,7 @@ impl MutualExclusion for SuzukiKasami {
         }
     }
 
-    fn lost(&mut self, context: &Context<'_>, peer: &Peer, gone: bool, out: &mut Vec<Step>) {
+    fn lost(&mut self, context: &Context<'_>, peer: &LockPeer, gone: bool, out: &mut Vec<Step>) {
         let name = peer.shared_name();
         let known = self.requests.get(name);
         if gone && known.is_some_and(|known| known.peer == *peer) {
@@ -517,7 +517,7 @@ impl MutualExclusion for SuzukiKasami {
         self.own.as_ref().is_some_and(|own| own.entered)
     }
 
-    fn awaited(&self) -> BTreeSet<Peer> {
+    fn awaited(&self) -> BTreeSet<LockPeer> {
         match &self.away {
             Some(away) if self.extended && !away.over => BTreeSet::from([away.to.clone()]),
             _ => BTreeSet::new(),

@@ -505,7 +505,7 @@ impl Token {
 }
 
 fn agent(name: &str) -> Result<Arc<str>, DecodeError> {
-    Ok(crate::Peer::new(name, 0)?.shared_name().clone())
+    Ok(crate::LockPeer::new(name, 0)?.shared_name().clone())
 }
 
 #[cfg(test)]

@@ -262,7 +262,7 @@ fn act() -> impl Strategy<Value = (Algorithm, Act)> {
     let number = 0..=i32::MAX as u64;
     let position = (any::<u64>(), any::<u64>());
     let fence = (name(), position, any::<u64>()).prop_map(|(owner, position, run)| {
-        let owner = crate::Peer::new(&owner, 0).unwrap();
+        let owner = crate::LockPeer::new(&owner, 0).unwrap();
         Fence::new(&owner, &Resource::new("bay").unwrap(), position, run)
     });
     let fence = fence.boxed();

@@ -12,8 +12,8 @@ use crate::holder::{Holder, HolderStep};
 use crate::owner::{Ending, Grant, Owner, OwnerStep};
 use crate::probes::{ProbeStep, Probes};
 use crate::{
-    Act, Algorithm, Content, Conversation, Fence, Gate, LockDialect, LockMessage, Millis,
-    MutualExclusion, Options, OwnerState, Peer, Refusal, Resource,
+    Act, Algorithm, Content, Conversation, Fence, Gate, LockDialect, LockMessage, LockPeer, Millis,
+    MutualExclusion, Options, OwnerState, Refusal, Resource,
 };
 
 /// Maximum number of members. Messages of further agents are ignored.
@@ -39,7 +39,7 @@ pub enum Action {
     /// Send a message.
     Send {
         /// The receiver.
-        to: Peer,
+        to: LockPeer,
         /// The message.
         message: LockMessage,
     },
@@ -82,14 +82,14 @@ pub enum Event {
         /// The resource.
         resource: Resource,
         /// The owner.
-        by: Peer,
+        by: LockPeer,
     },
     /// Another agent claims a resource that this agent owns. Each owner admits its own fences only.
     Contested {
         /// The resource.
         resource: Resource,
         /// The other agent.
-        by: Peer,
+        by: LockPeer,
     },
     /// This agent does not own the resource: no state file, clock, agent or device says which epoch is
     /// higher than those of its earlier lives.
@@ -110,7 +110,7 @@ pub enum Event {
         /// The resource.
         resource: Resource,
         /// The other agent.
-        by: Peer,
+        by: LockPeer,
         /// Its algorithm.
         algorithm: Algorithm,
     },
@@ -136,7 +136,7 @@ pub enum Event {
         /// The resource.
         resource: Resource,
         /// The holder.
-        holder: Peer,
+        holder: LockPeer,
     },
 }
 
@@ -154,7 +154,7 @@ pub enum Failure {
     #[error("the owner {owner} does not answer")]
     Unreachable {
         /// The owner.
-        owner: Peer,
+        owner: LockPeer,
     },
     /// The time of the claim is over.
     #[error("timed out with an estimated {ahead} requests ahead")]
@@ -185,13 +185,13 @@ pub struct LockStatus {
     /// The resource.
     pub resource: Resource,
     /// Its owner, if known.
-    pub owner: Option<Peer>,
+    pub owner: Option<LockPeer>,
     /// The live grant, at the owner.
     pub grant: Option<Grant>,
     /// Agents that wait for a grant, at the owner.
-    pub waiters: Vec<Peer>,
+    pub waiters: Vec<LockPeer>,
     /// At the owner: another agent that claims the resource.
-    pub rival: Option<Peer>,
+    pub rival: Option<LockPeer>,
     /// Whether this agent holds the resource.
     pub is_held: bool,
     /// Number of claims of this agent that wait for the resource.
@@ -205,11 +205,11 @@ pub struct LockStatus {
 /// [`poll_timeout`](Self::poll_timeout).
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Locks<A> {
-    me: Peer,
+    me: LockPeer,
     kind: Algorithm,
     options: Options,
-    members: BTreeMap<Peer, Member>,
-    gone: VecDeque<Peer>,
+    members: BTreeMap<LockPeer, Member>,
+    gone: VecDeque<LockPeer>,
     greeted: Greeted,
     resources: BTreeMap<Resource, Entry<A>>,
     claims: BTreeMap<ClaimId, Claim>,
@@ -228,7 +228,7 @@ pub struct Locks<A> {
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Entry<A> {
-    owner: Option<Peer>,
+    owner: Option<LockPeer>,
     owned: Option<Owned>,
     /// Highest fence of each owner that this agent or a device of it has seen.
     seen: BTreeMap<Arc<str>, Fence>,
@@ -241,7 +241,7 @@ struct Entry<A> {
     algorithm: A,
     waiting: VecDeque<ClaimId>,
     current: Option<Current>,
-    dependencies: BTreeSet<Peer>,
+    dependencies: BTreeSet<LockPeer>,
     due: Option<Millis>,
 }
 
@@ -252,7 +252,7 @@ struct Owned {
     claim_until: Option<Millis>,
     needs_report: bool,
     /// Another agent that claims the resource.
-    rival: Option<Peer>,
+    rival: Option<LockPeer>,
 }
 
 /// The claim of this agent that takes part in the algorithm.
@@ -273,7 +273,7 @@ enum Phase {
         next: Millis,
     },
     Entered {
-        owner: Peer,
+        owner: LockPeer,
         holder: Holder,
     },
 }
@@ -304,7 +304,7 @@ type Actions = Vec<Action>;
 impl<A: MutualExclusion> Locks<A> {
     /// Creates the core of an agent without members and resources.
     #[must_use]
-    pub fn new(me: Peer, kind: Algorithm, options: Options) -> Self {
+    pub fn new(me: LockPeer, kind: Algorithm, options: Options) -> Self {
         Self {
             me,
             kind,
@@ -327,7 +327,7 @@ impl<A: MutualExclusion> Locks<A> {
 
     /// This agent.
     #[must_use]
-    pub fn me(&self) -> &Peer {
+    pub fn me(&self) -> &LockPeer {
         &self.me
     }
 
@@ -339,19 +339,19 @@ impl<A: MutualExclusion> Locks<A> {
     }
 
     /// The other members.
-    pub fn members(&self) -> impl Iterator<Item = &Peer> {
+    pub fn members(&self) -> impl Iterator<Item = &LockPeer> {
         self.members.keys()
     }
 
     /// Whether this registration is a member.
     #[must_use]
-    pub fn is_member(&self, peer: &Peer) -> bool {
+    pub fn is_member(&self, peer: &LockPeer) -> bool {
         self.members.contains_key(peer)
     }
 
     /// Owner of a resource, if it is known.
     #[must_use]
-    pub fn owner_of(&self, resource: &Resource) -> Option<&Peer> {
+    pub fn owner_of(&self, resource: &Resource) -> Option<&LockPeer> {
         self.resources.get(resource)?.owner.as_ref()
     }
 
@@ -597,7 +597,7 @@ impl<A: MutualExclusion> Locks<A> {
     }
 
     /// Tells an owner the highest fence of it that was seen here.
-    fn tell_seen(&mut self, now: Millis, owner: &Peer, resource: &Resource, out: &mut Actions) {
+    fn tell_seen(&mut self, now: Millis, owner: &LockPeer, resource: &Resource, out: &mut Actions) {
         let entry = self.resources.get(resource);
         let seen = entry.and_then(|entry| entry.seen.get(owner.shared_name()));
         if let Some(fence) = seen.cloned() {
@@ -619,7 +619,7 @@ impl<A: MutualExclusion> Locks<A> {
     fn report_to(
         &mut self,
         now: Millis,
-        owner: Peer,
+        owner: LockPeer,
         fence: &Fence,
         resource: &Resource,
         out: &mut Actions,
@@ -680,7 +680,7 @@ impl<A: MutualExclusion> Locks<A> {
     // ----- members
 
     /// Adds a member, or updates its dialect.
-    pub fn join(&mut self, now: Millis, peer: &Peer, dialect: LockDialect, out: &mut Actions) {
+    pub fn join(&mut self, now: Millis, peer: &LockPeer, dialect: LockDialect, out: &mut Actions) {
         self.admit_member(now, peer, dialect, out);
         self.settle(now, out);
     }
@@ -690,7 +690,7 @@ impl<A: MutualExclusion> Locks<A> {
     /// and become members.
     ///
     /// Only Ricart-Agrawala needs the wait.
-    pub fn expect(&mut self, now: Millis, peer: &Peer) {
+    pub fn expect(&mut self, now: Millis, peer: &LockPeer) {
         let is_needed = !self.kind.has_token()
             && *peer != self.me
             && !self.members.contains_key(peer)
@@ -703,7 +703,7 @@ impl<A: MutualExclusion> Locks<A> {
 
     /// Removes a member whose registration has ended: its process ended, or it has left. Its grants
     /// end at once, and its late messages are ignored. The caller has to have a proof.
-    pub fn depart(&mut self, now: Millis, peer: &Peer, out: &mut Actions) {
+    pub fn depart(&mut self, now: Millis, peer: &LockPeer, out: &mut Actions) {
         if !self.gone.contains(peer) {
             self.gone.push_back(peer.clone());
             if self.gone.len() > MAX_GONE {
@@ -724,7 +724,7 @@ impl<A: MutualExclusion> Locks<A> {
         &mut self,
         now: Millis,
         resource: &Resource,
-        owner: &Peer,
+        owner: &LockPeer,
         dialect: LockDialect,
         out: &mut Actions,
     ) {
@@ -738,7 +738,7 @@ impl<A: MutualExclusion> Locks<A> {
         &mut self,
         now: Millis,
         resource: &Resource,
-        owner: &Peer,
+        owner: &LockPeer,
         dialect: LockDialect,
         algorithm: Option<Algorithm>,
         out: &mut Actions,
@@ -753,7 +753,7 @@ impl<A: MutualExclusion> Locks<A> {
     // ----- input
 
     /// Asks an agent for a sign of life.
-    pub fn probe(&mut self, now: Millis, to: Peer, out: &mut Actions) {
+    pub fn probe(&mut self, now: Millis, to: LockPeer, out: &mut Actions) {
         let message = LockMessage {
             conversation: self.side_conversation("probe", now),
             dialect: LockDialect::Own,
@@ -764,7 +764,13 @@ impl<A: MutualExclusion> Locks<A> {
     }
 
     /// Handles a message. `from` is the sender, as far as its connection proves it.
-    pub fn handle(&mut self, now: Millis, from: &Peer, message: &LockMessage, out: &mut Actions) {
+    pub fn handle(
+        &mut self,
+        now: Millis,
+        from: &LockPeer,
+        message: &LockMessage,
+        out: &mut Actions,
+    ) {
         let was_suspected = self
             .members
             .get(from)
@@ -816,7 +822,7 @@ impl<A: MutualExclusion> Locks<A> {
             .min()
     }
 
-    fn dispatch(&mut self, now: Millis, from: &Peer, message: &LockMessage, out: &mut Actions) {
+    fn dispatch(&mut self, now: Millis, from: &LockPeer, message: &LockMessage, out: &mut Actions) {
         let conversation = &message.conversation;
         match &message.content {
             Content::Probe => {
@@ -878,7 +884,7 @@ impl<A: MutualExclusion> Locks<A> {
     fn discover(
         &mut self,
         now: Millis,
-        from: &Peer,
+        from: &LockPeer,
         resource: &Resource,
         conversation: &Conversation,
         (act, algorithm): (&Act, Option<Algorithm>),
@@ -958,7 +964,7 @@ impl<A: MutualExclusion> Locks<A> {
     fn for_owner(
         &mut self,
         now: Millis,
-        from: &Peer,
+        from: &LockPeer,
         resource: &Resource,
         conversation: &Conversation,
         act: &Act,
@@ -999,7 +1005,7 @@ impl<A: MutualExclusion> Locks<A> {
     fn for_holder(
         &mut self,
         now: Millis,
-        from: &Peer,
+        from: &LockPeer,
         resource: &Resource,
         conversation: &Conversation,
         act: &Act,
@@ -1060,7 +1066,7 @@ impl<A: MutualExclusion> Locks<A> {
     fn for_algorithm(
         &mut self,
         now: Millis,
-        from: &Peer,
+        from: &LockPeer,
         resource: &Resource,
         conversation: &Conversation,
         (act, algorithm): (&Act, Option<Algorithm>),
@@ -1120,7 +1126,7 @@ impl<A: MutualExclusion> Locks<A> {
     fn admit_member(
         &mut self,
         now: Millis,
-        peer: &Peer,
+        peer: &LockPeer,
         dialect: LockDialect,
         out: &mut Actions,
     ) -> bool {
@@ -1174,13 +1180,13 @@ impl<A: MutualExclusion> Locks<A> {
     }
 
     /// An expected agent has answered or has left.
-    fn no_longer_expect(&mut self, peer: &Peer) {
+    fn no_longer_expect(&mut self, peer: &LockPeer) {
         if self.greeted.no_longer_expect(peer) {
             self.touched.extend(self.resources.keys().cloned());
         }
     }
 
-    fn suspect(&mut self, now: Millis, peer: &Peer, out: &mut Actions) {
+    fn suspect(&mut self, now: Millis, peer: &LockPeer, out: &mut Actions) {
         if let Some(member) = self.members.get_mut(peer) {
             member.suspected = true;
         }
@@ -1206,7 +1212,7 @@ impl<A: MutualExclusion> Locks<A> {
         &mut self,
         now: Millis,
         resource: &Resource,
-        peer: &Peer,
+        peer: &LockPeer,
         gone: bool,
         out: &mut Actions,
     ) {
@@ -1232,7 +1238,7 @@ impl<A: MutualExclusion> Locks<A> {
         &mut self,
         now: Millis,
         resource: &Resource,
-        peer: &Peer,
+        peer: &LockPeer,
         gone: bool,
         out: &mut Actions,
     ) {
@@ -1277,7 +1283,7 @@ impl<A: MutualExclusion> Locks<A> {
         &mut self,
         now: Millis,
         resource: &Resource,
-        peer: &Peer,
+        peer: &LockPeer,
         named: Option<Algorithm>,
         out: &mut Actions,
     ) {
@@ -1759,7 +1765,7 @@ impl<A: MutualExclusion> Locks<A> {
     }
 
     /// Agents whose loss changes the state of a resource here.
-    fn dependencies(&self, now: Millis, resource: &Resource) -> BTreeSet<Peer> {
+    fn dependencies(&self, now: Millis, resource: &Resource) -> BTreeSet<LockPeer> {
         let Some(entry) = self.resources.get(resource) else {
             return BTreeSet::new();
         };
@@ -1926,7 +1932,7 @@ impl<A: MutualExclusion> Locks<A> {
 
     fn send(
         &mut self,
-        to: Peer,
+        to: LockPeer,
         resource: &Resource,
         conversation: Conversation,
         act: Act,
@@ -1940,7 +1946,7 @@ impl<A: MutualExclusion> Locks<A> {
     fn send_in(
         &mut self,
         kind: Algorithm,
-        to: Peer,
+        to: LockPeer,
         resource: &Resource,
         conversation: Conversation,
         act: Act,
@@ -1971,7 +1977,7 @@ impl<A: MutualExclusion> Locks<A> {
     }
 
     #[cfg(test)]
-    fn probed(&mut self, now: Millis, from: &Peer) {
+    fn probed(&mut self, now: Millis, from: &LockPeer) {
         for entry in self.resources.values_mut() {
             if let Some(Current {
                 phase: Phase::Entered { owner, holder },

@@ -9,15 +9,15 @@
 use super::{Actions, Current, Locks, Phase};
 use crate::locks::{Action, ClaimId, Event, Failure};
 use crate::{
-    Act, Algorithm, Content, Conversation, LockDialect, LockMessage, Millis, MutualExclusion, Peer,
-    Refusal, Resource,
+    Act, Algorithm, Content, Conversation, LockDialect, LockMessage, LockPeer, Millis,
+    MutualExclusion, Refusal, Resource,
 };
 
 /// A request that waited at an owner that is lost.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Former {
     pub(super) claim: ClaimId,
-    owner: Peer,
+    owner: LockPeer,
     conversation: Conversation,
     pub(super) place: Option<u32>,
 }
@@ -93,7 +93,12 @@ impl<A: MutualExclusion> Locks<A> {
     }
 
     /// The algorithm that a message contains. Agents of `distributed_locking` know no names of algorithms.
-    pub(super) fn algorithm_in(&self, act: &Act, kind: Algorithm, to: &Peer) -> Option<Algorithm> {
+    pub(super) fn algorithm_in(
+        &self,
+        act: &Act,
+        kind: Algorithm,
+        to: &LockPeer,
+    ) -> Option<Algorithm> {
         match act {
             act if is_of_algorithm(act) => Some(kind),
             Act::Granted { .. } | Act::Refused { .. } | Act::Release => Some(kind),
@@ -111,7 +116,7 @@ impl<A: MutualExclusion> Locks<A> {
     /// algorithm. A member that does not know the owner takes the algorithm of the message.
     pub(super) fn is_refused(
         &mut self,
-        from: &Peer,
+        from: &LockPeer,
         message: &LockMessage,
         out: &mut Actions,
     ) -> bool {
@@ -174,7 +179,7 @@ impl<A: MutualExclusion> Locks<A> {
     pub(super) fn algorithm_refused(
         &mut self,
         now: Millis,
-        from: &Peer,
+        from: &LockPeer,
         resource: &Resource,
         conversation: &Conversation,
         kind: Algorithm,
@@ -215,7 +220,7 @@ impl<A: MutualExclusion> Locks<A> {
     // ----- lost owners
 
     /// Handles the loss of the owner of a resource with a queue, which may return. A lease is used to its end.
-    pub(super) fn lose_queue(&mut self, now: Millis, resource: &Resource, peer: &Peer) {
+    pub(super) fn lose_queue(&mut self, now: Millis, resource: &Resource, peer: &LockPeer) {
         let until = now.saturating_add(self.options.discovery);
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
@@ -251,7 +256,7 @@ impl<A: MutualExclusion> Locks<A> {
     }
 
     /// Whether an agent that begins to own a resource is its earlier owner, which has restarted.
-    pub(super) fn is_return(&self, resource: &Resource, from: &Peer) -> bool {
+    pub(super) fn is_return(&self, resource: &Resource, from: &LockPeer) -> bool {
         self.resources.get(resource).is_some_and(|entry| {
             let former = entry.former.as_ref().map(|former| &former.owner);
             let mut owners = entry.owner.iter().chain(former);
@@ -305,7 +310,7 @@ impl<A: MutualExclusion> Locks<A> {
     // ----- members
 
     /// Handles a sign of life of a member that was suspected.
-    pub(super) fn heard_again(&mut self, now: Millis, peer: &Peer, out: &mut Actions) {
+    pub(super) fn heard_again(&mut self, now: Millis, peer: &LockPeer, out: &mut Actions) {
         let owned = self.resources.iter().filter(|(_, entry)| {
             let core = entry.owned.as_ref().map(|owned| &owned.core);
             entry.kind == Algorithm::OwnerQueue

@@ -8,7 +8,7 @@ use crate::faults::Fault;
 use crate::invariants::{History, Turns};
 use crate::{
     Act, Action, Admission, Algorithm, AnyAlgorithm, ClaimId, Content, Conversation, Event, Fence,
-    LockDialect, LockMessage, Locks, Millis, NotAdmitted, Options, OwnerState, Peer, Resource,
+    LockDialect, LockMessage, LockPeer, Locks, Millis, NotAdmitted, Options, OwnerState, Resource,
 };
 
 /// The time of each state. It exceeds every span, so that no time before it is cut off at 0.
@@ -75,7 +75,7 @@ pub(super) struct System {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct State {
     agents: Vec<Agent>,
-    network: BTreeSet<(Peer, Peer, LockMessage)>,
+    network: BTreeSet<(LockPeer, LockPeer, LockMessage)>,
     history: History,
     /// State files of the owner on two hosts, and its host.
     files: [Option<OwnerState>; 2],
@@ -90,15 +90,15 @@ pub(super) struct State {
     ticks: u8,
     left: Faults,
     /// Registrations that have ended, and the agents that have no proof of it.
-    unnoticed: BTreeSet<(Peer, u8)>,
+    unnoticed: BTreeSet<(LockPeer, u8)>,
     /// Registrations, and the agents whose directory does not list them yet.
-    unlisted: BTreeSet<(Peer, u8)>,
+    unlisted: BTreeSet<(LockPeer, u8)>,
     turns: Turns,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Agent {
-    me: Peer,
+    me: LockPeer,
     /// A crashed agent has none.
     locks: Option<Locks<AnyAlgorithm>>,
     paused: bool,
@@ -112,13 +112,13 @@ pub(super) enum Step {
     Lock(u8),
     Release(u8),
     Withdraw(u8),
-    Deliver(Peer, Peer, LockMessage),
+    Deliver(LockPeer, LockPeer, LockMessage),
     Tick,
-    Notice(Peer, u8),
-    List(Peer, u8),
+    Notice(LockPeer, u8),
+    List(LockPeer, u8),
     Resume(u8),
-    Lose(Peer, Peer, LockMessage),
-    Duplicate(Peer, Peer, LockMessage),
+    Lose(LockPeer, LockPeer, LockMessage),
+    Duplicate(LockPeer, LockPeer, LockMessage),
     Crash(u8),
     Return(u8),
     Pause(u8),
@@ -173,7 +173,7 @@ impl System {
         (self.foreign_owner && agent == 0) || self.foreigner == Some(agent)
     }
 
-    fn dialect(&self, peer: &Peer) -> LockDialect {
+    fn dialect(&self, peer: &LockPeer) -> LockDialect {
         let is = (0..)
             .take(self.claims.len())
             .find(|agent| name(*agent) == peer.name());
@@ -184,7 +184,7 @@ impl System {
     }
 
     fn agent(&self, agent: u8, registration: u64) -> Agent {
-        let me = Peer::new(name(agent), registration).unwrap();
+        let me = LockPeer::new(name(agent), registration).unwrap();
         let mut options = self.options(agent);
         options.first_conversation = registration * 32;
         Agent {
@@ -379,7 +379,7 @@ impl System {
         self.perform(state, agent, actions);
     }
 
-    fn deliver(&self, state: &mut State, to: &Peer, from: &Peer, message: &LockMessage) {
+    fn deliver(&self, state: &mut State, to: &LockPeer, from: &LockPeer, message: &LockMessage) {
         let agent = state.agents.iter().position(|agent| agent.me == *to);
         let Some(agent) = agent else {
             return;
@@ -496,7 +496,7 @@ impl System {
     }
 
     /// The directory of an agent lists another one.
-    fn list(&self, state: &mut State, peer: &Peer, agent: u8) {
+    fn list(&self, state: &mut State, peer: &LockPeer, agent: u8) {
         let dialect = self.dialect(peer);
         if self.is_foreign(agent) {
             // It asks all agents that it knows, and greets none.
@@ -576,7 +576,7 @@ impl State {
             .expect("not crashed")
     }
 
-    fn is_paused(&self, peer: &Peer) -> bool {
+    fn is_paused(&self, peer: &LockPeer) -> bool {
         self.agents
             .iter()
             .any(|agent| agent.me == *peer && agent.paused)

@@ -13,7 +13,7 @@
 use std::collections::VecDeque;
 
 use crate::owner::OwnerStep;
-use crate::{Act, Conversation, Gate, LockDialect, Millis, Peer};
+use crate::{Act, Conversation, Gate, LockDialect, LockPeer, Millis};
 
 /// Highest place in an owner's queue that a member is told.
 pub const MAX_PLACE: u32 = 8;
@@ -35,7 +35,7 @@ struct Rules {
 /// A request that waits.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) struct Waiter {
-    pub(crate) peer: Peer,
+    pub(crate) peer: LockPeer,
     pub(crate) conversation: Conversation,
     /// Time that the grant repeats. Legacy agents have none.
     pub(crate) asked: Option<Millis>,
@@ -57,7 +57,7 @@ enum Presence {
 }
 
 impl Waiter {
-    pub(crate) fn new(peer: Peer, conversation: Conversation, asked: Option<Millis>) -> Self {
+    pub(crate) fn new(peer: LockPeer, conversation: Conversation, asked: Option<Millis>) -> Self {
         Self {
             peer,
             conversation,
@@ -91,7 +91,7 @@ impl Queue {
         self.waiters.get(index)
     }
 
-    pub(crate) fn find(&mut self, peer: &Peer) -> Option<&mut Waiter> {
+    pub(crate) fn find(&mut self, peer: &LockPeer) -> Option<&mut Waiter> {
         self.waiters.iter_mut().find(|waiter| waiter.peer == *peer)
     }
 
@@ -100,7 +100,7 @@ impl Queue {
     }
 
     /// Removes the request of this conversation.
-    pub(crate) fn withdraw(&mut self, peer: &Peer, conversation: &Conversation) {
+    pub(crate) fn withdraw(&mut self, peer: &LockPeer, conversation: &Conversation) {
         self.waiters
             .retain(|waiter| waiter.peer != *peer || waiter.conversation != *conversation);
     }
@@ -108,7 +108,7 @@ impl Queue {
     /// Adds a request at the end, or replaces the earlier one of the member. Returns whether it is new.
     pub(crate) fn add(
         &mut self,
-        peer: &Peer,
+        peer: &LockPeer,
         conversation: &Conversation,
         asked: Option<Millis>,
     ) -> bool {
@@ -130,7 +130,7 @@ impl Queue {
     }
 
     /// Sorts a request by its place in the owner's life before.
-    pub(crate) fn sort_in(&mut self, peer: &Peer, place: u32) {
+    pub(crate) fn sort_in(&mut self, peer: &LockPeer, place: u32) {
         let index = self.waiters.iter().position(|waiter| waiter.peer == *peer);
         let Some(mut waiter) = index.and_then(|index| self.waiters.remove(index)) else {
             return;
@@ -143,7 +143,7 @@ impl Queue {
     }
 
     /// Handles the loss of a member. `gone` is a proof that its registration or its process has ended.
-    pub(crate) fn lost(&mut self, peer: &Peer, gone: bool) {
+    pub(crate) fn lost(&mut self, peer: &LockPeer, gone: bool) {
         if gone || self.rules.is_none() {
             self.waiters.retain(|waiter| waiter.peer != *peer);
         } else if let Some(waiter) = self.find(peer)
@@ -154,7 +154,7 @@ impl Queue {
     }
 
     /// Handles a sign of life.
-    pub(crate) fn heard(&mut self, peer: &Peer) {
+    pub(crate) fn heard(&mut self, peer: &LockPeer) {
         if let Some(waiter) = self.find(peer) {
             waiter.presence = Presence::Present;
         }

@@ -4,8 +4,8 @@ use super::*;
 
 const TIMEOUT: Millis = 10;
 
-fn peer(number: usize) -> Peer {
-    Peer::new(&format!("agent{number}"), 1).unwrap()
+fn peer(number: usize) -> LockPeer {
+    LockPeer::new(&format!("agent{number}"), 1).unwrap()
 }
 
 fn queue() -> Queue {

@@ -5,8 +5,8 @@ use std::sync::{Arc, LazyLock};
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Message, Performative};
-use fipa_locking::{Algorithm, LockMessage, Millis, Peer, codec};
-use fipa_monitor::{Header, History, Library, Monitor, Policy, Verdict};
+use fipa_locking::{Algorithm, LockMessage, LockPeer, Millis, codec};
+use fipa_monitor::{Header, History, Library, Monitor, MonitorPolicy, Verdict};
 
 const RECORDED: &str = include_str!("../vectors/distributed_locking.txt");
 
@@ -19,20 +19,28 @@ pub(crate) struct Checked {
 }
 
 impl Checked {
-    pub(crate) fn new(kind: Algorithm, me: &Peer) -> Self {
+    pub(crate) fn new(kind: Algorithm, me: &LockPeer) -> Self {
         let monitor = Monitor::agent(Arc::clone(&LIBRARY), me.name());
         // An earlier registration of the name may have begun conversations.
         let history = match me.registration() {
             1 => History::Complete,
             _ => History::Unknown,
         };
-        let monitor = monitor.with_policy(Policy::strict()).with_history(history);
+        let monitor = monitor
+            .with_policy(MonitorPolicy::strict())
+            .with_history(history);
         Self { monitor, kind }
     }
 
     /// Checks a message that this agent sends or receives.
-    pub(crate) fn check(&mut self, now: Millis, from: &Peer, to: &Peer, message: &LockMessage) {
-        let id = |peer: &Peer| AgentId::new(peer.name()).unwrap();
+    pub(crate) fn check(
+        &mut self,
+        now: Millis,
+        from: &LockPeer,
+        to: &LockPeer,
+        message: &LockMessage,
+    ) {
+        let id = |peer: &LockPeer| AgentId::new(peer.name()).unwrap();
         let written = codec::encode(message, self.kind, &id(from), &id(to)).unwrap();
         let now = SystemTime::UNIX_EPOCH + Duration::from_millis(now);
         let verdict = self.monitor.check(&Header::from(&written), now);
@@ -131,7 +139,7 @@ fn play(protocol: &str, words: &[&str]) {
     let observer = Monitor::observer(Arc::clone(&library));
     let agents = ["ann", "ben"].map(|name| {
         let monitor = Monitor::agent(Arc::clone(&library), name);
-        monitor.with_policy(Policy::strict())
+        monitor.with_policy(MonitorPolicy::strict())
     });
     for (index, mut monitor) in [observer].into_iter().chain(agents).enumerate() {
         for word in words {

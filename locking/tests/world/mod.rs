@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use fastrand::Rng;
 use fipa_locking::invariants::{History, Turns, all_or_none};
 use fipa_locking::{
-    Act, Action, Algorithm, AnyAlgorithm, ClaimId, Content, Event, LockDialect, LockMessage, Locks,
-    Millis, Options, OwnerState, Peer, Resource,
+    Act, Action, Algorithm, AnyAlgorithm, ClaimId, Content, Event, LockDialect, LockMessage,
+    LockPeer, Locks, Millis, Options, OwnerState, Resource,
 };
 
 use crate::protocols::Checked;
@@ -46,7 +46,7 @@ pub(crate) struct World {
     /// Links that drop messages.
     cut: BTreeSet<(usize, usize)>,
     /// Time of the last arrival of each link, if messages keep their order.
-    arrivals: BTreeMap<(Peer, Peer), Millis>,
+    arrivals: BTreeMap<(LockPeer, LockPeer), Millis>,
     /// The last events, when one seed is repeated.
     log: Option<VecDeque<String>>,
     pub(crate) messages: u64,
@@ -56,7 +56,7 @@ pub(crate) struct World {
 }
 
 struct Agent {
-    me: Peer,
+    me: LockPeer,
     locks: Option<Locks<AnyAlgorithm>>,
     /// Clock: rate in per mille, and offset.
     rate: u64,
@@ -66,7 +66,7 @@ struct Agent {
     claim: Option<ActiveClaim>,
     claims_left: u64,
     /// Messages that arrived during a pause.
-    inbox: Vec<(Peer, LockMessage)>,
+    inbox: Vec<(LockPeer, LockMessage)>,
 }
 
 struct ActiveClaim {
@@ -77,8 +77,8 @@ struct ActiveClaim {
 
 enum Occurrence {
     Arrive {
-        to: Peer,
-        from: Peer,
+        to: LockPeer,
+        from: LockPeer,
         message: LockMessage,
     },
     Claim(usize),
@@ -89,12 +89,12 @@ enum Occurrence {
     Heal(usize, usize),
     Notice {
         agent: usize,
-        ended: Peer,
+        ended: LockPeer,
     },
 }
 
-fn peer(agent: usize, registration: u64) -> Peer {
-    Peer::new(&format!("agent{agent}"), registration).unwrap()
+fn peer(agent: usize, registration: u64) -> LockPeer {
+    LockPeer::new(&format!("agent{agent}"), registration).unwrap()
 }
 
 /// The log of the seed that is repeated, when it has failed.
@@ -253,7 +253,7 @@ impl World {
         }
     }
 
-    fn send(&mut self, agent: usize, to: Peer, message: LockMessage) {
+    fn send(&mut self, agent: usize, to: LockPeer, message: LockMessage) {
         self.messages += 1;
         let from = self.agents[agent].me.clone();
         if let Some(monitor) = &mut self.agents[agent].monitor {
@@ -374,7 +374,7 @@ impl World {
         }
     }
 
-    fn arrive(&mut self, to: &Peer, from: Peer, message: LockMessage) {
+    fn arrive(&mut self, to: &LockPeer, from: LockPeer, message: LockMessage) {
         let Some(agent) = self.agents.iter().position(|agent| agent.me == *to) else {
             return;
         };
@@ -401,7 +401,7 @@ impl World {
     }
 
     /// Records that a request has reached an agent.
-    fn reached(&mut self, agent: usize, from: &Peer, message: &LockMessage) {
+    fn reached(&mut self, agent: usize, from: &LockPeer, message: &LockMessage) {
         let Content::Lock { act, .. } = &message.content else {
             return;
         };

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Message, Performative};
-use fipa_monitor::{Header, Library, Limits, Monitor};
+use fipa_monitor::{Header, Library, Monitor, MonitorLimits};
 
 pub(crate) fn now() -> SystemTime {
     SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000)
@@ -46,7 +46,7 @@ pub(crate) fn answer(act: Performative, protocol: &str, number: usize) -> Messag
 
 /// A monitor with open subscriptions, and a further message of each.
 pub(crate) fn with_open(count: usize) -> (Monitor, Vec<Message>) {
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.conversations = 2_000_000;
     limits.bytes = usize::MAX;
     let library = Arc::new(Library::standard());

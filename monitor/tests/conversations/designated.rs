@@ -348,7 +348,7 @@ fn unchecked_answers_keep_a_conversation_from_being_removed() {
 
 #[test]
 fn the_limits_apply_to_conversations_that_began_elsewhere() {
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     (limits.conversations, limits.participants, limits.embedded) = (4, 3, 1);
     let monitor = Monitor::agent(library(), "dan").with_limits(limits);
     let mut stage = Stage::new(monitor);
@@ -372,7 +372,7 @@ fn the_limits_apply_to_conversations_that_began_elsewhere() {
     assert_eq!(fourth.kind, Kind::WrongReceiver);
     // Bytes: the answers of too long names are not kept.
     let share = 1 << 14;
-    let mut small = Limits::default();
+    let mut small = MonitorLimits::default();
     small.bytes = share * 8;
     let mut stage = Stage::new(Monitor::agent(library(), "dan").with_limits(small));
     for number in 0..20 {

@@ -157,7 +157,7 @@ fn the_limit_of_participants_is_exact() {
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
         <state id="3" final="yes"/></scxml>"#;
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.participants = 2;
     let monitor = Monitor::observer(library_with("own", text)).with_limits(limits);
     assert!(monitor.library().find("own").is_some());
@@ -444,7 +444,7 @@ fn the_initiator_may_name_itself_and_others_in_reply_to() {
     let mut stage = stage_of(ONE_STATE);
     stage.right(own("request ann>ben").reply_to(["ann", "dan"]));
     assert_eq!(stage.right(own("agree ben>ann,dan")), "3");
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.participants = 4;
     let monitor = Monitor::observer(library_with("own", ONE_STATE)).with_limits(limits);
     let mut stage = Stage::new(monitor);

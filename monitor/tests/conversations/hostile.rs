@@ -2,13 +2,13 @@
 
 use super::*;
 
-fn enforced(policy: Policy) -> Stage {
+fn enforced(policy: MonitorPolicy) -> Stage {
     Stage::new(Monitor::agent(library(), "ben").with_policy(policy))
 }
 
 #[test]
 fn a_peer_evicts_only_its_own_conversations() {
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.conversations = 800;
     let monitor = Monitor::agent(library(), "ben").with_limits(limits);
     let mut stage = Stage::new(monitor);
@@ -37,7 +37,7 @@ fn a_peer_evicts_only_its_own_conversations() {
 
 #[test]
 fn a_later_message_may_not_name_more_bytes_than_the_share_of_a_peer() {
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.bytes = 1 << 20;
     let mut stage = Stage::new(Monitor::agent(library(), "ben").with_limits(limits));
     stage.right(request("request ann>ben"));
@@ -56,7 +56,7 @@ fn a_conversation_at_its_share_of_bytes_continues_if_it_does_not_grow() {
         call.reply_with("call")
     };
     let called = |share: usize| {
-        let mut limits = Limits::default();
+        let mut limits = MonitorLimits::default();
         limits.bytes = share * 8;
         let mut stage = Stage::new(Monitor::observer(library_once()).with_limits(limits));
         let is_accepted = stage.check(&call()).is_accepted();
@@ -84,7 +84,7 @@ fn a_conversation_at_its_share_of_bytes_continues_if_it_does_not_grow() {
 fn a_report_of_many_undelivered_messages_does_not_exceed_the_share_of_a_peer() {
     let (mut refused, mut taken) = (0, 0);
     for share in (2_000..40_000).step_by(500) {
-        let mut limits = Limits::default();
+        let mut limits = MonitorLimits::default();
         limits.bytes = share * 8;
         let mut stage = Stage::new(Monitor::observer(library_once()).with_limits(limits));
         let all = || (0..20).map(|number| format!("arm {number}"));
@@ -121,7 +121,7 @@ fn a_conversation_cannot_grow_beyond_the_share_of_a_peer() {
     for protocol in ["plain", "fipa-contract-net"] {
         let cfp = || say_in(protocol, "cfp ann>ben").reply_with("call");
         for (length, reply_to, share) in [(1, 0, 1 << 13), (9, 3, 1 << 14), (4_000, 0, 1 << 17)] {
-            let mut limits = Limits::default();
+            let mut limits = MonitorLimits::default();
             limits.bytes = share * 8;
             let mut accepted = 0;
             for count in 1..300 {
@@ -156,7 +156,7 @@ fn a_conversation_cannot_grow_beyond_the_share_of_a_peer() {
 #[test]
 fn members_of_a_pattern_and_agents_with_several_roles_are_bounded() {
     let share = 1 << 17;
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.bytes = share * 8;
     let long = |number: usize| format!("{number:x<4000}");
     let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
@@ -206,7 +206,7 @@ fn the_copies_of_a_message_are_bounded() {
         ("b", 1 << 20, 30, 29..30),
         ("b|c", 1 << 20, 30, 30..31),
     ] {
-        let mut limits = Limits::default();
+        let mut limits = MonitorLimits::default();
         (limits.bytes, limits.participants) = (share * 8, participants);
         let library = library_with("plain", &text(to));
         let mut stage = Stage::new(Monitor::observer(library).with_limits(limits));
@@ -226,7 +226,7 @@ fn the_copies_of_a_message_are_bounded() {
 
 #[test]
 fn the_bytes_of_a_peer_are_bounded() {
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.bytes = 8 << 20;
     let monitor = Monitor::agent(library(), "ben").with_limits(limits);
     let mut stage = Stage::new(monitor);
@@ -256,7 +256,7 @@ fn the_bytes_of_a_peer_are_bounded() {
 
 #[test]
 fn what_is_too_large_to_check_is_refused_for_an_agent() {
-    let mut stage = enforced(Policy::default());
+    let mut stage = enforced(MonitorPolicy::default());
     let many = (0..2_000).map(|number| number.to_string());
     for header in [
         request("agree ann>ben").conversation_id("c".repeat(5_000)),
@@ -283,7 +283,7 @@ fn a_policy_refuses_messages_without_a_conversation() {
     let reqest = || say_in("fipa-reqest", "request ann>ben");
     let unsolicited = || say_in("fipa-contract-net", "accept-proposal ann>ben");
     let answer = || request("inform ann>ben").conversation_id("d");
-    let mut lax = enforced(Policy::default());
+    let mut lax = enforced(MonitorPolicy::default());
     for (header, why) in [
         (no_id(), Unchecked::NoConversation),
         (reqest(), Unchecked::UnknownProtocol),
@@ -292,7 +292,7 @@ fn a_policy_refuses_messages_without_a_conversation() {
     ] {
         assert_eq!(lax.check(&header), Verdict::Unchecked(why));
     }
-    let mut strict = enforced(Policy::strict());
+    let mut strict = enforced(MonitorPolicy::strict());
     for (header, kind, reason) in [
         (no_id(), Kind::NoConversation, "no conversation-id"),
         (
@@ -314,7 +314,7 @@ fn a_policy_refuses_messages_without_a_conversation() {
     let unknown = Verdict::Unchecked(Unchecked::UnknownProtocol);
     assert_eq!(strict.check(&other), unknown);
     strict.right(request("request ann>ben"));
-    let mut policy = Policy::strict();
+    let mut policy = MonitorPolicy::strict();
     policy.exempt.insert("FIPA-Request".into());
     policy.exempt.insert("fipa-contract-net".into());
     let mut exempt = enforced(policy);
@@ -332,16 +332,16 @@ fn a_message_of_a_conversation_that_may_have_begun_is_not_unsolicited() {
         assert!(matches!(verdict, Verdict::Unchecked(_)), "{verdict:?}");
     };
     // The agent continues conversations of an earlier registration, or a `reply-to` names it.
-    let mut stage = enforced(Policy::strict());
+    let mut stage = enforced(MonitorPolicy::strict());
     stage.monitor.set_history(History::Unknown);
     unknown(&mut stage);
-    let mut stage = enforced(Policy::strict());
+    let mut stage = enforced(MonitorPolicy::strict());
     stage.monitor.expect("d");
     unknown(&mut stage);
     let other = request("inform ann>ben").conversation_id("e");
     assert_eq!(stage.wrong(other).kind, Kind::Unsolicited);
     // The monitor has removed the conversation after its idle time.
-    let mut stage = enforced(Policy::strict());
+    let mut stage = enforced(MonitorPolicy::strict());
     stage.right(request("request ben>ann").conversation_id("d"));
     stage.pass(100_000);
     assert!(stage.monitor.is_empty());
@@ -489,7 +489,7 @@ fn an_outsider_reports_no_undelivered_message() {
 
 #[test]
 fn a_report_of_a_service_is_no_violation_and_begins_nothing() {
-    let mut strict = Policy::default();
+    let mut strict = MonitorPolicy::default();
     strict.unsolicited = true;
     let monitor = Monitor::agent(library(), "ann").with_policy(strict);
     let mut stage = Stage::new(monitor);
@@ -513,7 +513,7 @@ fn a_report_of_a_service_is_no_violation_and_begins_nothing() {
 /// Within a second, the list of conversations is not sorted anew.
 #[test]
 fn the_oldest_conversation_of_a_peer_cannot_grow_beyond_its_share() {
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.bytes = 8 << 20;
     let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
     let long = |number: usize| format!("{number}{}", "x".repeat(4_000));
@@ -537,7 +537,7 @@ fn no_conversation_is_evicted_before_the_limit_of_bytes() {
     // The conversations of the agent count toward the total, and those of a peer toward its share.
     for (words, parts) in [("request ben>ann", 1), ("request ann>ben", 8)] {
         let filled = |bytes| {
-            let mut limits = Limits::default();
+            let mut limits = MonitorLimits::default();
             limits.bytes = bytes * parts;
             let mut stage = Stage::new(Monitor::agent(library_once(), "ben").with_limits(limits));
             for number in 0..COUNT {
@@ -566,7 +566,7 @@ fn no_message_exceeds_a_share_of_any_size() {
     };
     let mut accepted = [0; 3];
     for share in 400..3_000 {
-        let mut limits = Limits::default();
+        let mut limits = MonitorLimits::default();
         limits.bytes = share * 8;
         let monitor = Monitor::observer(Arc::clone(&library)).with_limits(limits);
         let mut stage = Stage::new(monitor);
@@ -600,7 +600,7 @@ fn a_conversation_beyond_the_share_of_its_peer_evicts_others_if_the_whole_is_too
         call.reply_with("call")
     };
     let observer = |share: usize| {
-        let mut limits = Limits::default();
+        let mut limits = MonitorLimits::default();
         limits.bytes = share * 8;
         Stage::new(Monitor::observer(library_once()).with_limits(limits))
     };

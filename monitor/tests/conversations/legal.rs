@@ -142,7 +142,7 @@ fn a_first_message_may_be_a_later_one_of_an_unknown_conversation() {
 
 #[test]
 fn an_evicted_conversation_is_unchecked() {
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.conversations = 4;
     let monitor = Monitor::agent(library(), "ben").with_limits(limits);
     let mut stage = Stage::new(monitor);

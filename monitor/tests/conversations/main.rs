@@ -17,8 +17,8 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Message, MessageView, Performative, Time};
 use fipa_monitor::{
-    Event, Header, History, Library, Limits, Machine, Moment, Monitor, Policy, Unchecked, Verdict,
-    Violation, ViolationKind as Kind,
+    Event, Header, History, Library, Machine, Moment, Monitor, MonitorLimits, MonitorPolicy,
+    Unchecked, Verdict, Violation, ViolationKind as Kind,
 };
 
 const START: Duration = Duration::from_secs(1_700_000_000);
@@ -591,7 +591,7 @@ fn ended_and_abandoned_conversations_are_removed() {
 
 #[test]
 fn the_limits_are_enforced() {
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     (limits.conversations, limits.participants, limits.embedded) = (3, 4, 2);
     let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
     for id in ["1", "2", "3"] {

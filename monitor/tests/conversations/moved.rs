@@ -217,7 +217,7 @@ fn the_limits_of_the_next_monitor_hold() {
         stage.pass(2);
     }
     let taken = stage.monitor.snapshot(stage.now);
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.conversations = 10;
     let mut next = Monitor::agent(library(), "ben").with_limits(limits);
     assert_eq!(
@@ -376,7 +376,7 @@ fn a_snapshot_has_at_most_the_bytes_of_the_limit() {
     let library = library_with("own", &text);
     let own = |number: u8| say_in("own", "request ben>ann").conversation_id(format!("{number:02}"));
     let taken = |bytes| {
-        let mut limits = Limits::default();
+        let mut limits = MonitorLimits::default();
         limits.bytes = bytes;
         let monitor = Monitor::agent(Arc::clone(&library), "ben").with_limits(limits);
         let mut stage = Stage::new(monitor);
@@ -515,7 +515,7 @@ fn conversations_that_no_monitor_writes_are_refused() {
         <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
         <state id="3" final="yes"/></scxml>"#;
     let library = library_with("own", text);
-    let mut limits = Limits::default();
+    let mut limits = MonitorLimits::default();
     limits.participants = 100;
     let restored = |change: fn(&mut Written), written: fn() -> Written| {
         let mut stage = Stage::new(Monitor::agent(Arc::clone(&library), "ben").with_limits(limits));

@@ -33,7 +33,8 @@ impl Watching {
         // The content begins with the number of the letter.
         let bytes = record::of(notice, Wish { content: 64 }, utc);
         let record = Record::parse(&bytes.into()).map_err(|error| error.to_string())?;
-        self.joiner.handle(now, RecordSource(process as u64), record);
+        self.joiner
+            .handle(now, RecordSource(process as u64), record);
         while let Some(event) = self.joiner.poll_event(now) {
             self.see(event)?;
         }

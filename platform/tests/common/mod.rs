@@ -7,8 +7,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 use fipa_platform::{
-    AgentDescription, Ams, Answer, ApDescription, Asker, Constraints, Df, Exception, Function,
-    ONTOLOGY, Platform, PlatformTime, Resident, ServiceDescription,
+    AgentDescription, Ams, ApDescription, Asker, Constraints, Df, Exception, Function, ONTOLOGY,
+    Platform, PlatformAnswer, PlatformTime, Resident, ServiceDescription,
 };
 
 pub(crate) const OTHER: Platform = Platform::Proved([7; 32]);
@@ -104,7 +104,7 @@ impl Facilitator {
         seconds: f64,
         asker: &Asker,
         message: &Message,
-    ) -> Option<Answer> {
+    ) -> Option<PlatformAnswer> {
         let now = self.clock.after(seconds);
         self.df.handle_message(now, asker, message);
         self.df.poll_answer()
@@ -176,7 +176,7 @@ impl Management {
         seconds: f64,
         asker: &Asker,
         message: &Message,
-    ) -> Option<Answer> {
+    ) -> Option<PlatformAnswer> {
         let now = self.clock.after(seconds);
         self.ams
             .handle_message(now, asker, message, &self.residents);
@@ -201,7 +201,7 @@ impl Management {
 }
 
 /// Returns the answer if it is an `inform`, else its reason. The performative is that of the reason.
-pub(crate) fn judged(answer: Answer) -> Result<Message, Exception> {
+pub(crate) fn judged(answer: PlatformAnswer) -> Result<Message, Exception> {
     let message = answer.message;
     if *message.performative() == Performative::Inform {
         return Ok(message);

@@ -8,7 +8,7 @@ use fipa_transport::Signature;
 use super::peers;
 use super::{Area, Check, Severity};
 use crate::admin::routes::{
-    Connected, ContestedName, Namesakes, RefusedConnection, RefusedDial, Report, StaticPeer,
+    Connected, ContestedName, Namesakes, RefusedConnection, RefusedDial, RouteReport, StaticPeer,
 };
 use crate::{Config, Kind};
 
@@ -35,7 +35,11 @@ const REFUSED_ADVICE: &str =
 /// Age in seconds of the latest refusal of a connection of this gateway. Without letters, it does not try again.
 const RECENT_DIAL: u64 = 3_600;
 
-pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &mut Vec<Check>) {
+pub(super) fn examine(
+    config: &Config,
+    report: Result<&RouteReport, &str>,
+    checks: &mut Vec<Check>,
+) {
     let report = match report {
         Ok(report) => report,
         Err(why) => {
@@ -58,7 +62,7 @@ pub(super) fn examine(config: &Config, report: Result<&Report, &str>, checks: &m
 }
 
 /// Compares the configuration of the gateway with this one.
-fn configuration(config: &Config, report: &Report) -> Check {
+fn configuration(config: &Config, report: &RouteReport) -> Check {
     let here = config.values();
     let keys: BTreeSet<&String> = here.keys().chain(report.configuration.keys()).collect();
     let differing = keys.into_iter().filter_map(|key| {
@@ -153,7 +157,7 @@ fn refused_dial(refused: &RefusedDial) -> Check {
 }
 
 /// Reports gateways with the same name.
-fn namesakes(report: &Report, found: &Namesakes) -> Check {
+fn namesakes(report: &RouteReport, found: &Namesakes) -> Check {
     let name = escape(&found.name);
     let at: Vec<String> = found.at.iter().map(ToString::to_string).collect();
     let at = at.join(", ");
@@ -182,7 +186,7 @@ fn namesakes(report: &Report, found: &Namesakes) -> Check {
 
 /// The TCP addresses of gateways that are known but not connected, without those of the configuration,
 /// which have a check of their own. Each has the name of an agent there.
-fn unconnected(config: &Config, report: &Report) -> Vec<(String, String)> {
+fn unconnected(config: &Config, report: &RouteReport) -> Vec<(String, String)> {
     let listed = config.discovery.peers.iter();
     let listed: BTreeSet<&str> = listed
         .flat_map(|peer| &peer.locations)
@@ -218,12 +222,12 @@ mod tests {
     use super::*;
 
     /// The report of a gateway with this configuration, and without peers.
-    fn report(config: &Config) -> Report {
+    fn report(config: &Config) -> RouteReport {
         let empty = serde_json::json!({
             "mts": "sherpa", "incarnation": "0000000000000001", "locations": [], "routes": [],
             "ways": [], "peers": [], "neighbors": [],
         });
-        let mut report: Report = serde_json::from_value(empty).unwrap();
+        let mut report: RouteReport = serde_json::from_value(empty).unwrap();
         report.configuration = config.values();
         report
     }

@@ -89,7 +89,7 @@ pub fn examine(config: &Config) -> Vec<Check> {
 #[must_use]
 pub fn examine_gateway(
     config: &Config,
-    report: Result<&crate::admin::routes::Report, &str>,
+    report: Result<&crate::admin::routes::RouteReport, &str>,
 ) -> Vec<Check> {
     let mut checks = Vec::new();
     gateway::examine(config, report, &mut checks);

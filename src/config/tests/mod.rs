@@ -11,7 +11,8 @@ use proptest::prelude::*;
 
 use super::reader::Reader;
 use super::{
-    Check, Config, ConfigError, Effective, Interface, Origin, PeerConfig, PlatformAgent, RouteConfig, Sources,
+    Check, Config, ConfigError, Effective, Interface, Origin, PeerConfig, PlatformAgent,
+    RouteConfig, Sources,
 };
 
 /// Loads a text as if it stood in `./fipa.toml`.

@@ -256,7 +256,7 @@ impl GatewayAgent {
         };
         let entries = report::agents(&*self.view, &query);
         let neighbors = self.neighbors.all().into_iter();
-        let report = routes::Report {
+        let report = routes::RouteReport {
             neighbors: neighbors.map(Into::into).collect(),
             refused: self.refusals.latest().into_iter().map(Into::into).collect(),
             refused_dials: self

@@ -20,7 +20,7 @@ use tokio::sync::{Notify, watch};
 use tokio::time;
 
 use crate::end::{self, ConnectionEnd};
-use crate::stream::config::Limits;
+use crate::stream::config::NetLimits;
 
 /// Maximum number of bytes per write; the stall timeout applies to each write.
 const STEP: usize = 256 << 10;
@@ -144,7 +144,7 @@ impl LegacySenders {
     /// When the parcel cannot be queued.
     pub(crate) fn send<S: LegacySender>(
         &self,
-        (limits, runtime, sink): (&Limits, &Handle, Arc<dyn Sink>),
+        (limits, runtime, sink): (&NetLimits, &Handle, Arc<dyn Sink>),
         attempt: AttemptId,
         to: &Location,
         parcel: Parcel,
@@ -164,7 +164,7 @@ impl LegacySenders {
     /// Queues a parcel. Returns whether the task of its location must be started.
     fn take(
         &self,
-        limits: &Limits,
+        limits: &NetLimits,
         attempt: AttemptId,
         to: &Location,
         parcel: Parcel,

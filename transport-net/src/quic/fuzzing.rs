@@ -30,7 +30,7 @@ use crate::stream::link::{Link, LinkTask};
 use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 use crate::stream::wire::{BoxFuture, ControlStream, Reading, StreamWriter, Writing};
-use crate::{Identity, Limits};
+use crate::{Identity, NetLimits};
 
 const MAX_LETTER: usize = 100_000;
 const MAX_IN_FLIGHT: usize = 8;
@@ -323,12 +323,12 @@ impl QuicStreams {
     /// answer parcels at once.
     #[must_use]
     pub fn new(refuses: bool, lends: bool, answers: bool) -> Self {
-        let limits = Limits {
+        let limits = NetLimits {
             max_letter: MAX_LETTER,
             max_in_flight: MAX_IN_FLIGHT,
             max_incoming: MAX_INCOMING,
             max_incoming_per_source: MAX_INCOMING,
-            ..Limits::default()
+            ..NetLimits::default()
         };
         let identity = Identity {
             name: "fuzzed".into(),

@@ -34,7 +34,7 @@ use self::sockets::Sockets;
 use crate::secure::Security;
 use crate::stream::config::StreamConfig;
 use crate::stream::endpoint::Endpoint;
-use crate::{Counters, Identity, Limits, Refusals, RefusedDials};
+use crate::{Counters, Identity, NetLimits, Refusals, RefusedDials};
 
 /// Configuration of a [`QuicTransport`].
 #[derive(Debug, Clone)]
@@ -43,9 +43,9 @@ pub struct QuicConfig {
     pub listen: Vec<String>,
     /// Identity of this endpoint.
     pub identity: Identity,
-    /// Limits and timeouts. In addition, a connection holds at most 33 MiB of unread and 8 MiB of
+    /// NetLimits and timeouts. In addition, a connection holds at most 33 MiB of unread and 8 MiB of
     /// unacknowledged bytes.
-    pub limits: Limits,
+    pub limits: NetLimits,
     /// Receives the connections of this side that peers refuse.
     pub refused_dials: RefusedDials,
     /// Credentials and trust. QUIC always requires them; the exceptions of its rules do not apply

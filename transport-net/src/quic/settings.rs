@@ -6,7 +6,7 @@ use std::time::Duration;
 use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
 use quinn::{ClientConfig, Connection, IdleTimeout, ServerConfig, TransportConfig, VarInt};
 
-use crate::Limits;
+use crate::NetLimits;
 use crate::secure::Security;
 
 /// The ALPN protocol name (RFC 7301).
@@ -51,7 +51,7 @@ const MAX_INCOMING: usize = 256;
 const INCOMING_BUFFER: u64 = 16 << 10;
 const INCOMING_BUFFERS: u64 = 1 << 20;
 
-pub(super) fn transport(limits: &Limits) -> Arc<TransportConfig> {
+pub(super) fn transport(limits: &NetLimits) -> Arc<TransportConfig> {
     let mut transport = TransportConfig::default();
     // Ping frames detect silent peers; this timeout detects peers that fail during the handshake.
     let silence = (limits.keep_alive * 4).max(limits.handshake_timeout);

@@ -17,7 +17,7 @@ use rustls::pki_types::CertificateDer;
 use socket2::{Domain, Protocol, Socket, Type};
 
 use super::settings;
-use crate::Limits;
+use crate::NetLimits;
 use crate::secure::Security;
 use crate::secure::advice::{self, Finder, TlsFailure};
 use crate::stream::proof::Proof;
@@ -31,7 +31,7 @@ pub(super) struct Sockets {
 }
 
 impl Sockets {
-    pub(super) fn new(security: Security, limits: &Limits) -> Self {
+    pub(super) fn new(security: Security, limits: &NetLimits) -> Self {
         Self {
             security,
             transport: settings::transport(limits),

@@ -15,7 +15,7 @@ use crate::refused_dials::RefusedDials;
 #[derive(Debug, Clone)]
 pub(crate) struct StreamConfig {
     pub(crate) identity: Identity,
-    pub(crate) limits: Limits,
+    pub(crate) limits: NetLimits,
     /// Receives the connections of this side that peers refuse.
     pub(crate) refused_dials: RefusedDials,
     /// Whether processes of this host connect over loopback.
@@ -135,11 +135,11 @@ impl StreamConfig {
     }
 }
 
-/// Limits of an endpoint that sends letters over byte streams. Memory is bounded by about
+/// NetLimits of an endpoint that sends letters over byte streams. Memory is bounded by about
 /// `max_incoming` for arriving letters, and `max_connections` × `max_queued_bytes` for letters that
 /// wait to be sent, the latter only when this side sends them.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Limits {
+pub struct NetLimits {
     /// Largest letter sent or taken, in bytes. Default 64 MiB.
     pub max_letter: usize,
     /// Maximum number of connections whose peer has introduced itself, or that this side opened.
@@ -195,7 +195,7 @@ pub struct Limits {
     /// Timeout of the peer's hello on a new connection. Default 5 s.
     pub handshake_timeout: Duration,
     /// Period in which a partly arrived frame, or letter of a legacy peer, must progress by at
-    /// least [`Limits::MIN_PROGRESS`] bytes. Default 10 s.
+    /// least [`NetLimits::MIN_PROGRESS`] bytes. Default 10 s.
     pub stall_timeout: Duration,
     /// Time without a byte from the peer after which it gets a ping; after the same time again
     /// without a byte the connection is given up. Default 10 s.
@@ -204,7 +204,7 @@ pub struct Limits {
     pub idle_close: Duration,
 }
 
-impl Limits {
+impl NetLimits {
     /// Number of bytes that must arrive within `stall_timeout` while a frame has partly arrived.
     pub const MIN_PROGRESS: u64 = 4096;
 
@@ -217,7 +217,7 @@ impl Limits {
     }
 }
 
-impl Default for Limits {
+impl Default for NetLimits {
     fn default() -> Self {
         Self {
             max_letter: 64 << 20,
@@ -275,7 +275,7 @@ mod tests {
         ] {
             let config = StreamConfig {
                 identity: identity("here", "test"),
-                limits: Limits::default(),
+                limits: NetLimits::default(),
                 refused_dials: RefusedDials::default(),
                 processes,
                 refusals: crate::refusals::Refusals::default(),

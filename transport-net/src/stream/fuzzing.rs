@@ -11,7 +11,7 @@ use fipa_transport::{
 };
 
 use super::budget::{ByteBudget, ContentBuffer};
-use super::config::Limits;
+use super::config::NetLimits;
 use super::connection::{Connection, Event, Reader, Role};
 use super::frame::{self, FrameReader, Space};
 use crate::Identity;
@@ -108,10 +108,10 @@ impl Framed {
     /// Creates the end that opened the connection, expecting incarnation 7, or the other one.
     #[must_use]
     pub fn new(opened: bool, lends: bool, now: Instant) -> Self {
-        let limits = Limits {
+        let limits = NetLimits {
             max_letter: MAX_LETTER,
             max_in_flight: MAX_IN_FLIGHT,
-            ..Limits::default()
+            ..NetLimits::default()
         };
         let role = match opened {
             true => Role::Dialler {

@@ -3,7 +3,7 @@
 //! A legacy peer opens one connection per letter and closes it after the letter, so the letters of
 //! one address must be passed on in the order in which their connections were accepted. The queue
 //! of an address grants two permissions in that order: to read (at most
-//! [`Limits::max_reads_per_address`] connections at once; the others wait in the kernel's buffers),
+//! [`NetLimits::max_reads_per_address`] connections at once; the others wait in the kernel's buffers),
 //! and to pass on a letter that has been read.
 //!
 //! A connection without progress for [`TURN`] loses its turn: the letters behind it no longer wait
@@ -26,7 +26,7 @@ use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
 use super::endpoint::TcpEndpoint;
-use crate::stream::config::Limits;
+use crate::stream::config::NetLimits;
 use crate::stream::counters::count;
 
 /// Time without a byte after which a connection loses its turn.
@@ -98,7 +98,7 @@ impl State {
     /// connection without a byte is evicted, because no letter is lost with it.
     fn admit(
         &mut self,
-        limits: &Limits,
+        limits: &NetLimits,
         home: IpAddr,
         entry: Entry,
         is_silent: impl Fn(&Entry) -> bool,
@@ -147,7 +147,7 @@ impl State {
     }
 
     /// Removes a connection, and grants its permissions to others.
-    fn remove(&mut self, limits: &Limits, home: IpAddr, ticket: u64) -> Option<Entry> {
+    fn remove(&mut self, limits: &NetLimits, home: IpAddr, ticket: u64) -> Option<Entry> {
         let peer = self.peers.get_mut(&home)?;
         let entry = peer.turns.remove(&ticket)?;
         self.left = self.left.wrapping_add(1);
@@ -170,11 +170,11 @@ impl State {
     }
 
     /// Lets connections of an address be read, in the order of acceptance, as far as there is room.
-    fn grant(&mut self, limits: &Limits, home: IpAddr) {
+    fn grant(&mut self, limits: &NetLimits, home: IpAddr) {
         while self.grant_one(limits, home) {}
     }
 
-    fn grant_one(&mut self, limits: &Limits, home: IpAddr) -> bool {
+    fn grant_one(&mut self, limits: &NetLimits, home: IpAddr) -> bool {
         let Some(peer) = self.peers.get_mut(&home) else {
             return false;
         };
@@ -198,7 +198,7 @@ impl State {
     }
 
     /// Lets connections of all addresses be read, first those of the address with the fewest.
-    fn grant_others(&mut self, limits: &Limits) {
+    fn grant_others(&mut self, limits: &NetLimits) {
         while self.reading < limits.max_strangers {
             let peers = self.peers.iter();
             let waits = peers.filter(|(_, peer)| {
@@ -214,7 +214,7 @@ impl State {
 
     /// Takes the turn from a connection that is read and makes no progress. When all readable
     /// connections of the address are stalled and others wait, the older half is evicted.
-    fn stall(&mut self, limits: &Limits, home: IpAddr, ticket: u64) -> Evicted {
+    fn stall(&mut self, limits: &NetLimits, home: IpAddr, ticket: u64) -> Evicted {
         let mut evicted = Evicted::new();
         let Some(peer) = self.peers.get_mut(&home) else {
             return evicted;
@@ -421,13 +421,13 @@ mod tests {
 
     const HERE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::new(10, 0, 0, 1));
 
-    fn limits() -> Limits {
-        Limits {
+    fn limits() -> NetLimits {
+        NetLimits {
             max_strangers: 4,
             max_reads_per_address: 2,
             max_unread_per_address: 5,
             max_unread: 8,
-            ..Limits::default()
+            ..NetLimits::default()
         }
     }
 

@@ -3,7 +3,7 @@
 use crate::Identity;
 use crate::refusals::Refusals;
 use crate::refused_dials::RefusedDials;
-use crate::stream::config::Limits;
+use crate::stream::config::NetLimits;
 
 /// Configuration of a [`TcpTransport`](crate::TcpTransport).
 #[derive(Debug, Clone)]
@@ -16,8 +16,8 @@ pub struct TcpConfig {
     pub listen: Vec<String>,
     /// Identity of this endpoint.
     pub identity: Identity,
-    /// Limits and timeouts.
-    pub limits: Limits,
+    /// NetLimits and timeouts.
+    pub limits: NetLimits,
     /// Whether processes of this host connect over loopback. If not, a peer at a loopback address
     /// is unproved, even if it claims this host and domain, and must also prove its identity when
     /// `security` is set.
@@ -39,7 +39,7 @@ impl TcpConfig {
         Self {
             listen,
             identity,
-            limits: Limits::default(),
+            limits: NetLimits::default(),
             processes: false,
             refusals: Refusals::default(),
             refused_dials: RefusedDials::default(),

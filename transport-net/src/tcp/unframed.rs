@@ -11,7 +11,7 @@ use super::accept_queue::{QueueTurn, TURN};
 use super::endpoint::TcpEndpoint;
 use crate::legacy::letter::{self, LetterError};
 use crate::stream::budget::ReservedBytes;
-use crate::stream::config::Limits;
+use crate::stream::config::NetLimits;
 use crate::stream::counters::count;
 use crate::stream::source::QuotaKey;
 
@@ -107,7 +107,7 @@ async fn read_to_end(
             Err(_) => {
                 let progress = (bytes.len() - window.1) as u64;
                 let least = room.as_ref().map_or(0, ReservedBytes::least_progress);
-                if progress < least.max(Limits::MIN_PROGRESS) {
+                if progress < least.max(NetLimits::MIN_PROGRESS) {
                     return Err(UnframedError::TooSlow);
                 }
                 window = (Instant::now() + limits.stall_timeout, bytes.len());

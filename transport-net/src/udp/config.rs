@@ -18,11 +18,11 @@ pub struct UdpConfig {
     pub listen: Vec<String>,
     /// Identity of this endpoint.
     pub identity: Identity,
-    /// Limits and timeouts.
+    /// NetLimits and timeouts.
     pub limits: UdpLimits,
 }
 
-/// Limits of a UDP endpoint. Memory is bounded by about `max_incoming` for arriving parcels, and
+/// NetLimits of a UDP endpoint. Memory is bounded by about `max_incoming` for arriving parcels, and
 /// `max_connections` × `max_queued_bytes` for parcels to send.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UdpLimits {

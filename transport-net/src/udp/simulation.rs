@@ -667,7 +667,7 @@ impl UnprovedSlot {
     }
 }
 
-/// Limits with which no timeout ends a connection.
+/// NetLimits with which no timeout ends a connection.
 fn patient() -> UdpLimits {
     UdpLimits {
         connect_timeout: Duration::from_secs(1000),

@@ -30,7 +30,7 @@ use tokio::time::sleep;
 pub use self::directory::UnixError;
 use self::directory::{Directory, FileId};
 use crate::Identity;
-use crate::stream::config::{Limits, StreamConfig};
+use crate::stream::config::{NetLimits, StreamConfig};
 use crate::stream::counters::Counters;
 use crate::stream::endpoint::Endpoint;
 
@@ -50,8 +50,8 @@ pub struct UnixConfig {
     pub directory: PathBuf,
     /// Identity of this endpoint. Its socket is named after the incarnation.
     pub identity: Identity,
-    /// Limits and timeouts.
-    pub limits: Limits,
+    /// NetLimits and timeouts.
+    pub limits: NetLimits,
 }
 
 /// Carries parcels over Unix domain sockets between processes of one user on one host.

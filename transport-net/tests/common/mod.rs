@@ -26,7 +26,7 @@ use fipa_transport::{
     TransportError,
 };
 use fipa_transport_net::{
-    Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UnixConfig,
+    Identity, NetLimits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UnixConfig,
 };
 use parking_lot::Mutex;
 use tokio::runtime::{Handle, Runtime};
@@ -131,7 +131,7 @@ pub(crate) fn quic_config(
     fipa_transport_net::QuicConfig {
         listen: config.listen,
         identity: config.identity,
-        limits: Limits {
+        limits: NetLimits {
             // The network does not report an unreachable peer.
             connect_timeout: Duration::from_secs(3),
             ..config.limits

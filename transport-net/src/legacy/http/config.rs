@@ -1,7 +1,7 @@
 //! Configuration of an HTTP endpoint.
 
 use crate::Identity;
-use crate::stream::config::Limits;
+use crate::stream::config::NetLimits;
 
 /// Configuration of an [`HttpTransport`](crate::HttpTransport).
 #[derive(Debug, Clone)]
@@ -11,8 +11,8 @@ pub struct HttpConfig {
     pub listen: Vec<String>,
     /// Identity of this endpoint.
     pub identity: Identity,
-    /// Limits and timeouts.
-    pub limits: Limits,
+    /// NetLimits and timeouts.
+    pub limits: NetLimits,
     /// Credentials and trust. With them, letters are exchanged only with peers that are excepted
     /// from the proof of identity.
     #[cfg(feature = "secure")]

@@ -28,7 +28,7 @@ use super::socket::Socket;
 use crate::end;
 use crate::sockets::prepare;
 use crate::stream::budget::ReservedBytes;
-use crate::stream::config::Limits;
+use crate::stream::config::NetLimits;
 use crate::stream::counters::count;
 use crate::stream::proof::Proof;
 use crate::stream::source::{Home, QuotaKey, Source};
@@ -291,7 +291,7 @@ impl Serving {
         }
     }
 
-    fn limits(&self) -> &Limits {
+    fn limits(&self) -> &NetLimits {
         self.endpoint.stream.limits()
     }
 
@@ -355,7 +355,7 @@ impl Serving {
                 Err(_) => {
                     let progress = (window.1 - missing) as u64;
                     let least = room.as_ref().map_or(0, ReservedBytes::least_progress);
-                    if progress < least.max(Limits::MIN_PROGRESS) {
+                    if progress < least.max(NetLimits::MIN_PROGRESS) {
                         return Err(Refusal::SlowBody.into());
                     }
                     window = (Instant::now() + timeout, missing);

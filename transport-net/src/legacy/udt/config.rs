@@ -19,7 +19,7 @@ pub struct UdtConfig {
     /// Identity of this endpoint. Legacy peers do not learn it; its incarnation is part of the
     /// locations.
     pub identity: Identity,
-    /// Limits and timeouts.
+    /// NetLimits and timeouts.
     pub limits: UdtLimits,
     /// Credentials and trust. Peers cannot prove their identity over UDT. With credentials, letters
     /// are exchanged only with peers on loopback and with those that the credentials list as legacy
@@ -44,7 +44,7 @@ impl UdtConfig {
     }
 }
 
-/// Limits of a UDT endpoint. Memory is bounded by about `max_incoming` and 64 KiB per connection for
+/// NetLimits of a UDT endpoint. Memory is bounded by about `max_incoming` and 64 KiB per connection for
 /// arriving letters, and `max_connections` × `max_queued_bytes` for letters to send.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UdtLimits {

@@ -25,7 +25,7 @@ use super::sender::payload_of;
 use super::sequence;
 use crate::rate_limit::PeerRateLimit;
 use crate::stream::budget::{Meter, ReservedBytes};
-use crate::stream::config::Limits;
+use crate::stream::config::NetLimits;
 
 /// Bytes that a connection holds without a reservation.
 const UNRESERVED: usize = 64 << 10;
@@ -346,7 +346,7 @@ impl Receiver {
         let least = self.room.as_ref().map_or(0, ReservedBytes::least_progress);
         let progress = self.bytes - before;
         self.period = Some((now, self.bytes));
-        progress < least.max(Limits::MIN_PROGRESS)
+        progress < least.max(NetLimits::MIN_PROGRESS)
     }
 
     fn is_paused(&self, now: Instant) -> bool {

@@ -15,7 +15,7 @@ use fipa_transport::{
     Stream, TransportError, TransportErrorKind,
 };
 
-use super::config::Limits;
+use super::config::NetLimits;
 use super::frame::{self, Frame};
 use super::outbox::{About, Outbox, Progress};
 use super::proof::Proof;
@@ -75,7 +75,7 @@ pub(crate) enum SendError {
 
 #[derive(Debug)]
 pub(crate) struct Connection {
-    limits: Limits,
+    limits: NetLimits,
     role: Role,
     hello: Hello,
     peer: Option<Hello>,
@@ -171,7 +171,7 @@ struct Clock {
 
 impl Connection {
     /// Creates a connection whose socket is connected or, for the dialler, will be connected.
-    pub(crate) fn new(limits: Limits, role: Role, hello: Hello, now: Instant) -> Self {
+    pub(crate) fn new(limits: NetLimits, role: Role, hello: Hello, now: Instant) -> Self {
         let connected = (role == Role::Acceptor).then_some(now);
         Self {
             limits,
@@ -305,7 +305,7 @@ impl Connection {
         if !self.proof.speaks_for(&parcel.receiver) {
             return Err(SendError::Transport(not_its_agent(&parcel.receiver)));
         }
-        let Limits {
+        let NetLimits {
             max_in_flight,
             max_queued_bytes,
             ..
@@ -679,7 +679,7 @@ impl Connection {
             if let Some((since, bytes)) = *clock
                 && now >= since + self.limits.stall_timeout
             {
-                if bytes < least.max(Limits::MIN_PROGRESS) {
+                if bytes < least.max(NetLimits::MIN_PROGRESS) {
                     return Err(ConnectionEnd::TooSlow(
                         "the peer stopped sending in the middle of a frame (stall_timeout)",
                     ));

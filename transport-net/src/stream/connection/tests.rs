@@ -24,11 +24,11 @@ fn parcel(sequence: u64, len: usize) -> Parcel {
     }
 }
 
-fn limits() -> Limits {
-    Limits {
+fn limits() -> NetLimits {
+    NetLimits {
         max_letter: 5000,
         max_in_flight: 8,
-        ..Limits::default()
+        ..NetLimits::default()
     }
 }
 
@@ -573,7 +573,7 @@ fn a_stalled_frame_ends_the_connection_and_a_slow_one_does_not() {
     for _ in 0..3 {
         now += limits().stall_timeout / 2;
         a.connection
-            .received(Reader::Main, Limits::MIN_PROGRESS as usize, true, now);
+            .received(Reader::Main, NetLimits::MIN_PROGRESS as usize, true, now);
         now += limits().stall_timeout / 2;
         a.connection.handle_timeout(now, [0; 2]).unwrap();
     }
@@ -600,7 +600,7 @@ fn bytes_of_one_reader_are_no_progress_of_a_frame_at_the_other() {
         let due = start + limits().stall_timeout;
         let half = start + limits().stall_timeout / 2;
         for partial in [true, false] {
-            let enough = 2 * Limits::MIN_PROGRESS as usize;
+            let enough = 2 * NetLimits::MIN_PROGRESS as usize;
             a.connection.received(other, enough, partial, half);
         }
         assert!(a.connection.poll_timeout().unwrap() <= due);

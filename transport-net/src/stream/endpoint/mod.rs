@@ -37,7 +37,7 @@ use tokio::task::{AbortHandle, JoinHandle};
 use tokio::time::sleep;
 
 use super::budget::{ByteBudget, Meter, ReservedBytes};
-use super::config::{Limits, StreamConfig};
+use super::config::{NetLimits, StreamConfig};
 use super::connection::{Connection, Role, SendError, letter_len};
 use super::counters::{Tally, count};
 #[cfg(feature = "ip")]
@@ -288,7 +288,7 @@ impl Endpoint {
         })
     }
 
-    pub(crate) fn limits(&self) -> &Limits {
+    pub(crate) fn limits(&self) -> &NetLimits {
         &self.config.limits
     }
 

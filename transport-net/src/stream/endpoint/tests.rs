@@ -35,7 +35,7 @@ fn identity(incarnation: u64) -> Identity {
 }
 
 /// An endpoint without a listener. Must be used within a runtime.
-fn endpoint(limits: Limits) -> Arc<Endpoint> {
+fn endpoint(limits: NetLimits) -> Arc<Endpoint> {
     let config = StreamConfig {
         identity: identity(1 << 40),
         limits,
@@ -106,10 +106,10 @@ async fn enters(
 
 #[tokio::test]
 async fn no_source_has_more_than_half_of_the_slots() {
-    let endpoint = endpoint(Limits {
+    let endpoint = endpoint(NetLimits {
         max_connections: 16,
         max_per_address: 4,
-        ..Limits::default()
+        ..NetLimits::default()
     });
     let mut number = 0;
     let mut get_in = async |proved: Option<Principal>, from: &dyn Fn(u64) -> String| {
@@ -136,7 +136,7 @@ async fn no_source_has_more_than_half_of_the_slots() {
 
 #[tokio::test]
 async fn unproved_connections_of_one_source_evict_each_other() {
-    let limits = Limits::default();
+    let limits = NetLimits::default();
     let endpoint = endpoint(limits.clone());
     let slot = |from: &str| {
         let place = endpoint.admit_unproved(at(from)).unwrap();
@@ -187,7 +187,7 @@ async fn ends_when_asked_to(link: Arc<Link>) {
 
 #[tokio::test]
 async fn an_incarnation_belongs_to_the_certificate_it_is_connected_with() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let refused = |why| Err(ConnectionEnd::IdentityConflict(why));
     enters(&endpoint, comes(certificate(1), 7, "10.0.0.7:1", 1, X))
         .await
@@ -213,7 +213,7 @@ async fn an_incarnation_belongs_to_the_certificate_it_is_connected_with() {
 
 #[tokio::test]
 async fn a_moved_peer_with_keys_replaces_only_its_older_connection_for_the_same_location() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let proved = certificate(1);
     let (first, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
         .await
@@ -238,7 +238,7 @@ async fn a_moved_peer_with_keys_replaces_only_its_older_connection_for_the_same_
 
 #[tokio::test]
 async fn a_peer_without_keys_is_admitted_at_each_address_that_its_first_connection_lists() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let first = Greeting {
         listening: &["0.0.0.0:7788", "10.0.0.7:7788", "10.0.1.7:7788"],
         ..comes(None, 7, "10.0.0.7:1", 1, X)
@@ -271,7 +271,7 @@ async fn a_peer_without_keys_is_admitted_at_each_address_that_its_first_connecti
 
 #[tokio::test]
 async fn receive_windows_share_one_budget_with_a_share_for_each_certificate() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let limits = endpoint.limits().clone();
     let len = limits.max_incoming_per_source / 2 - 1;
     let quota_key = |number| QuotaKey::Certificate([number; 32]);
@@ -294,7 +294,7 @@ async fn receive_windows_share_one_budget_with_a_share_for_each_certificate() {
 
 #[tokio::test]
 async fn a_peer_that_dials_an_earlier_incarnation_keeps_its_connection_with_this_one() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let proved = certificate(1);
     let (good, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
         .await
@@ -319,7 +319,7 @@ async fn a_peer_that_dials_an_earlier_incarnation_keeps_its_connection_with_this
 async fn an_unproved_peer_elsewhere_is_refused_beside_a_service_that_is_alive() {
     for load in [Load::Any, Load::Large] {
         for (serial, dialed) in [(2, X), (2, Y), (0, X), (0, ""), (2, "")] {
-            let endpoint = endpoint(Limits::default());
+            let endpoint = endpoint(NetLimits::default());
             let honest = comes(None, 7, "10.0.0.7:1", 1, X);
             let (honest, _) = enters(&endpoint, honest).await.unwrap();
             let thief = Greeting {
@@ -425,7 +425,7 @@ impl<'a> Dispatcher<'a> {
 
 #[tokio::test]
 async fn large_letters_take_a_connection_of_their_own() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let mut to_arm = Dispatcher::new(&endpoint);
     let (small, large) = (letter_of(64 << 10, 1), letter_of(70_000, 1));
     assert_eq!(to_arm.post(&small), 0);
@@ -451,7 +451,7 @@ async fn large_letters_take_a_connection_of_their_own() {
 
 #[tokio::test]
 async fn a_large_letter_does_not_wait_for_an_attempt_that_has_ended() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let mut to_arm = Dispatcher::new(&endpoint);
     assert_eq!(to_arm.post(&letter_of(10, 1)), 0);
     to_arm.link(0).begins();
@@ -464,7 +464,7 @@ async fn a_large_letter_does_not_wait_for_an_attempt_that_has_ended() {
 
 #[tokio::test]
 async fn without_a_connection_of_their_own_large_letters_take_the_other_one() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let mut to_arm = Dispatcher::new(&endpoint);
     let (small, large) = (letter_of(10, 1), letter_of(70_000, 2));
     assert_eq!(to_arm.post(&large), 0);
@@ -478,7 +478,7 @@ async fn without_a_connection_of_their_own_large_letters_take_the_other_one() {
 
 #[tokio::test]
 async fn a_peer_has_a_connection_of_each_load() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let proved = certificate(1);
     let enter = async |serial, load| {
         let greeting = Greeting {
@@ -511,10 +511,10 @@ async fn a_peer_has_a_connection_of_each_load() {
 
 #[tokio::test]
 async fn letters_take_another_connection_when_one_is_suspect() {
-    let endpoint = endpoint(Limits {
+    let endpoint = endpoint(NetLimits {
         keep_alive: Duration::ZERO,
         connect_timeout: Duration::ZERO,
-        ..Limits::default()
+        ..NetLimits::default()
     });
     let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
     let first = dials(&endpoint, &to).await;
@@ -543,7 +543,7 @@ async fn letters_take_another_connection_when_one_is_suspect() {
 
 #[tokio::test]
 async fn letters_take_another_connection_after_their_peer_has_announced_another_address() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
     let moved: Location = "tcp://10.0.0.8:7788#0000000000000007".parse().unwrap();
     let dialed = dials(&endpoint, &to).await;
@@ -567,7 +567,7 @@ async fn letters_take_another_connection_after_their_peer_has_announced_another_
 /// A peer that has announced another address is not waited for as long as others.
 #[tokio::test]
 async fn a_question_ends_early_after_its_peer_has_announced_another_address() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
     let link = dials(&endpoint, &to).await;
     let asked = link.clone();
@@ -602,7 +602,7 @@ impl Sink for Errors {
 /// The hello of this side then finds a connection that is reset, before the bytes of the peer are read.
 #[tokio::test]
 async fn the_reason_of_a_peer_counts_when_writing_fails_first() {
-    let endpoint = endpoint(Limits::default());
+    let endpoint = endpoint(NetLimits::default());
     let errors = Arc::new(Errors::default());
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let peer = listener.local_addr().unwrap();
