@@ -13,12 +13,12 @@ use common::{Host, Running, unshared};
 use fipa_testbed::{until, until_some};
 use serde_json::Value;
 
-/// The verdict and the finding of a check.
+/// The severity and the finding of a check.
 fn check<'a>(report: &'a Value, name: &str) -> (&'a str, &'a str) {
     let checks = report["checks"].as_array().unwrap();
     let check = checks.iter().find(|check| check["check"] == name).unwrap();
     (
-        check["verdict"].as_str().unwrap(),
+        check["severity"].as_str().unwrap(),
         check["found"].as_str().unwrap(),
     )
 }
@@ -63,7 +63,7 @@ fn a_name_of_two_hosts_stays_with_the_agent_that_is_known_and_both_doctors_show_
             let checks = report["checks"].as_array().unwrap();
             checks.iter().any(|check| {
                 let found = check["found"].as_str().unwrap();
-                check["verdict"] == "doubtful" && found.starts_with(&expected)
+                check["severity"] == "warning" && found.starts_with(&expected)
             })
         });
         let own = host.run(&["agents", "arm", "--json"]).done_json();
@@ -119,8 +119,8 @@ fn files_of_a_killed_process_are_reported_until_the_next_process_removes_them() 
     );
     parrot.signal("-KILL");
     let dead = host.run(&["doctor", "--json"]).done_json();
-    let (verdict, found) = check(&dead, "leftovers of ended processes");
-    assert_eq!(verdict, "doubtful", "{found}");
+    let (severity, found) = check(&dead, "leftovers of ended processes");
+    assert_eq!(severity, "warning", "{found}");
     assert!(
         found.starts_with("processes that run: 0; ended processes that left files behind: 1;"),
         "{found}"
@@ -147,9 +147,9 @@ fn a_directory_that_others_may_enter_is_bad() {
     let domain = host.path("run").join(&host.domain);
     set_permissions(&domain, Permissions::from_mode(0o755)).unwrap();
     let (report, complaint) = host.run(&["doctor", "--json"]).failed_json();
-    assert_eq!(report["verdict"], "bad");
-    let (verdict, found) = check(&report, "directory of the domain");
-    assert_eq!(verdict, "bad");
+    assert_eq!(report["severity"], "bad");
+    let (severity, found) = check(&report, "directory of the domain");
+    assert_eq!(severity, "bad");
     assert!(
         found.contains(&format!("chmod 700 {}", domain.display())),
         "{found}"
@@ -177,8 +177,8 @@ fn without_inotify_letters_are_delivered_and_the_doctor_names_the_sysctl() {
     let doctor = without_inotify(&["doctor", "--json"]);
     let report = doctor.unwrap().output().unwrap().stdout;
     let report: Value = serde_json::from_slice(&report).unwrap();
-    let (verdict, found) = check(&report, "inotify instances");
-    assert_eq!(verdict, "doubtful", "{found}");
+    let (severity, found) = check(&report, "inotify instances");
+    assert_eq!(severity, "warning", "{found}");
     assert!(found.contains("polls the directory"), "{found}");
     assert!(report.to_string().contains("fs.inotify.max_user_instances"));
     let (code, log) = parrot.signal("-INT");
@@ -247,8 +247,8 @@ fn a_runtime_directory_without_room_is_bad_and_agents_name_it_as_the_cause() {
             return;
         };
         let report: Value = serde_json::from_slice(&report).unwrap();
-        let (verdict, found) = check(&report, "room in the directory of the domain");
-        assert_eq!(verdict, "bad", "{found}");
+        let (severity, found) = check(&report, "room in the directory of the domain");
+        assert_eq!(severity, "bad", "{found}");
         assert!(found.contains(&run) && found.contains(cause), "{found}");
         assert!(report.to_string().contains(remedy), "{report}");
         for command in [&["echo", "parrot"][..], &["up"]] {
@@ -280,8 +280,8 @@ fn a_runtime_directory_with_room_is_fine_and_stays_as_it_is() {
     };
     let before = files();
     let report = host.run(&["doctor", "--json"]).done_json();
-    let (verdict, found) = check(&report, "room in the directory of the domain");
-    assert_eq!(verdict, "fine", "{found}");
+    let (severity, found) = check(&report, "room in the directory of the domain");
+    assert_eq!(severity, "fine", "{found}");
     assert_eq!(files(), before);
 }
 
@@ -303,7 +303,7 @@ fn two_gateways_of_one_name_are_shown_on_both_hosts_and_a_restarted_one_is_not()
         let found = until_some("the doctor shows the name", || {
             checks(host, "names of gateways").pop()
         });
-        assert_eq!(found["verdict"], "doubtful", "{found}");
+        assert_eq!(found["severity"], "warning", "{found}");
         let text = found["found"].as_str().unwrap();
         // The far gateway opened the connection, so the near one shows the port of that connection, too.
         let there = others.rsplit_once(':').unwrap().0;

@@ -136,13 +136,13 @@ on_a_network!(
                 .clone()
         };
         let v4 = found("0.0.0.0");
-        assert_eq!(v4["verdict"], "bad", "{v4}");
+        assert_eq!(v4["severity"], "bad", "{v4}");
         assert!(
             v4["found"].as_str().unwrap().contains("but fd99::1"),
             "{v4}"
         );
         let all = found("*");
-        assert_eq!(all["verdict"], "fine", "{all}");
+        assert_eq!(all["severity"], "fine", "{all}");
         assert_eq!(all["found"], format!("tcp://[fd99::1]:{PORT}"));
     }
 );

@@ -164,13 +164,13 @@ fn a_certificate_is_not_revoked_without_confirmation() {
     assert_eq!((count("trusted"), count("revoked")), (0, 1));
 }
 
-/// The check of `fipa doctor` with this name, as verdict and finding.
+/// The check of `fipa doctor` with this name, as severity and finding.
 fn finding(report: &Value, name: &str) -> (String, String) {
     let checks = report["checks"].as_array().unwrap();
     let check = checks.iter().find(|check| check["check"] == name);
     let check = check.unwrap_or_else(|| panic!("no check {name}: {report}"));
     let text = |key: &str| check[key].as_str().unwrap().to_owned();
-    (text("verdict"), text("found"))
+    (text("severity"), text("found"))
 }
 
 #[test]
@@ -186,15 +186,15 @@ fn a_refusal_by_the_peer_is_shown_on_the_host_of_the_sender_until_the_peer_accep
         refused.next().cloned()
     };
     let check = until_some("the doctor shows the refusal", refused);
-    assert_eq!(check["verdict"], "doubtful", "{check}");
+    assert_eq!(check["severity"], "warning", "{check}");
     let found = check["found"].as_str().unwrap();
     assert!(found.starts_with(&address), "{found}");
     assert!(found.contains("trust"), "{found}");
     crex.keys(&["trust", &rover.certificate()]);
     until("the refusal is gone", || refused().is_none());
     let report = rover.host.run(&["doctor", "--json"]).done_json();
-    let (verdict, found) = finding(&report, "connections with other gateways");
-    assert_eq!(verdict, "fine", "{found}");
+    let (severity, found) = finding(&report, "connections with other gateways");
+    assert_eq!(severity, "fine", "{found}");
 }
 
 #[test]
@@ -240,8 +240,8 @@ fn the_certificate_of_each_connection_is_shown() {
 
     // The gateway was started with other values than those that the doctor reads.
     let report = rover.host.run(&["doctor", "--json"]).done_json();
-    let (verdict, found) = finding(&report, "configuration of the running gateway");
-    assert_eq!(verdict, "doubtful", "{found}");
+    let (severity, found) = finding(&report, "configuration of the running gateway");
+    assert_eq!(severity, "warning", "{found}");
     assert!(
         found.contains("security.keys = ")
             && found.contains("security.loopback = true (here: false)"),
@@ -261,7 +261,7 @@ fn the_doctor_of_both_hosts_says_which_one_has_keys() {
             let mut found = checks.filter(|it| it["check"] == check);
             found.any(|it| {
                 let text = it["found"].as_str().unwrap();
-                it["verdict"] == "doubtful" && parts.iter().all(|part| text.contains(part))
+                it["severity"] == "warning" && parts.iter().all(|part| text.contains(part))
             })
         });
     };

@@ -24,8 +24,8 @@ fn inside_the_doctor_reports_multicast_faults_of_the_network() {
     let network = Network::new(2);
     let (here, there) = (network.host(0), network.host(1));
 
-    let (verdict, found) = multicast(here);
-    assert_eq!(verdict, "doubtful", "{found}");
+    let (severity, found) = multicast(here);
+    assert_eq!(severity, "warning", "{found}");
     assert!(found.contains("no other host answered"), "{found}");
 
     let mut up = fipa(there, "there");
@@ -35,8 +35,8 @@ fn inside_the_doctor_reports_multicast_faults_of_the_network() {
     let _agent = ChildGuard::until_ready(echo.args(["echo", "parrot"]));
     let deadline = Instant::now() + Duration::from_secs(60);
     let found = loop {
-        let (verdict, found) = multicast(here);
-        if verdict == "fine" {
+        let (severity, found) = multicast(here);
+        if severity == "fine" {
             break found;
         }
         assert!(Instant::now() < deadline, "{found}");
@@ -48,15 +48,15 @@ fn inside_the_doctor_reports_multicast_faults_of_the_network() {
 
     // The switch does not forward multicast to this host; the other host receives it.
     here.forward_multicast(false);
-    let (verdict, found) = multicast(here);
-    assert_eq!(verdict, "doubtful", "{found}");
+    let (severity, found) = multicast(here);
+    assert_eq!(severity, "warning", "{found}");
     assert!(found.contains("incoming does not: 10.99.0.2"), "{found}");
     here.forward_multicast(true);
 
     // The switch does not forward multicast to the other host.
     there.forward_multicast(false);
-    let (verdict, found) = multicast(here);
-    assert_eq!(verdict, "doubtful", "{found}");
+    let (severity, found) = multicast(here);
+    assert_eq!(severity, "warning", "{found}");
     assert!(
         found.contains("outgoing may not: packets of 10.99.0.2"),
         "{found}"
@@ -64,8 +64,8 @@ fn inside_the_doctor_reports_multicast_faults_of_the_network() {
     there.forward_multicast(true);
 
     here.ip("link set eth0 down");
-    let (verdict, found) = multicast(here);
-    assert_eq!(verdict, "doubtful", "{found}");
+    let (severity, found) = multicast(here);
+    assert_eq!(severity, "warning", "{found}");
     assert!(found.contains("no interface is up"), "{found}");
 }
 
@@ -78,7 +78,7 @@ fn fipa(host: &Host, domain: &str) -> Command {
     command
 }
 
-/// The verdict and the finding of the doctor about multicast over IPv4.
+/// The severity and the finding of the doctor about multicast over IPv4.
 fn multicast(host: &Host) -> (String, String) {
     let output = fipa(host, "here").args(["doctor", "--json"]).output();
     let output = output.unwrap();
@@ -90,5 +90,5 @@ fn multicast(host: &Host) -> (String, String) {
         .find(|check| !check["found"].as_str().unwrap().contains("::"))
         .unwrap();
     let text = |key: &str| check[key].as_str().unwrap().to_owned();
-    (text("verdict"), text("found"))
+    (text("severity"), text("found"))
 }

@@ -335,7 +335,7 @@ on_a_network!(
         assert!(port["found"].as_str().unwrap().contains("nothing answered"), "{port}");
         assert!(port["advice"].as_str().unwrap().contains("sudo ufw allow 7788/tcp"), "{port}");
         let gateways = check("configuration of the running gateway");
-        assert_eq!(gateways["verdict"], "fine", "{gateways}");
+        assert_eq!(gateways["severity"], "fine", "{gateways}");
 
         // The gateway has tried again meanwhile.
         gateway.signal("-TERM");

@@ -9,8 +9,8 @@ use std::collections::{HashMap, HashSet};
 
 use fipa_acl::AgentId;
 use fipa_actions::{
-    ActionDescription, Ask, Executor, Failure, Goal, Json, Language, ActionLimits, OfferOptions, Orphans,
-    Output, ParameterDescription, Policy, Progress, Sl,
+    ActionDescription, ActionLimits, Ask, Executor, Failure, Goal, Json, Language, OfferOptions,
+    Orphans, Output, ParameterDescription, Policy, Progress, Sl,
 };
 use fipa_content::Term;
 

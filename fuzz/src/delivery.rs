@@ -807,7 +807,7 @@ impl World {
                 Action::Heard { .. }
                 | Action::HeardAgain { .. }
                 | Action::Taken { .. }
-                | Action::Doubtful { .. }
+                | Action::Suspect { .. }
                 | Action::Notice(_) => {}
             }
         }

@@ -6,8 +6,8 @@
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_locking::{
-    Act, Action, Algorithm, AnyAlgorithm, Content, Event, Fence, Locks, Options, OwnerState, LockPeer,
-    Resource, codec,
+    Act, Action, Algorithm, AnyAlgorithm, Content, Event, Fence, LockPeer, Locks, Options,
+    OwnerState, Resource, codec,
 };
 
 use crate::input::Input;

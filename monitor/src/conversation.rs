@@ -534,11 +534,11 @@ pub(crate) struct Rare {
     /// conversation, or because another agent may have that role.
     pub(crate) contested: bool,
     /// Roles that the monitored agent may have, because the message that excludes them may be of an outsider.
-    pub(crate) doubtful_roles: u32,
+    pub(crate) uncertain_roles: u32,
     /// Whether the last message of the monitored agent was reported as undelivered.
     pub(crate) undelivered: bool,
     /// Whether only a message of an agent that claimed a role has shown that such a message arrived.
-    pub(crate) doubtful: bool,
+    pub(crate) uncertain: bool,
     /// The last message of the monitored agent in it, until it is known to have arrived.
     pub(crate) last_sent: Option<LastSent>,
     /// The roles that the receivers of that message got with it, after it was reported as undelivered. It

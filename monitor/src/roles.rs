@@ -73,7 +73,7 @@ impl Monitor {
             let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
             rare.is_some_and(|rare| {
                 let waits = || rare.local.as_ref().is_some_and(LocalRun::waits);
-                rare.may_continue || rare.contested || rare.doubtful_roles != 0 || waits()
+                rare.may_continue || rare.contested || rare.uncertain_roles != 0 || waits()
             })
         };
         match denied {
@@ -179,11 +179,11 @@ impl Monitor {
                     party.state = state;
                 }
                 if let Some(role) = peer.filter(|role| free & (1 << role) != 0) {
-                    let doubtful = || {
+                    let uncertain = || {
                         // The sender of this message, or that of an earlier one, may be an outsider.
                         (own_roles | begun_roles(projection, observed)) & !kept_roles
                     };
-                    bind(conversation, &mut self.names, observed, role, doubtful);
+                    bind(conversation, &mut self.names, observed, role, uncertain);
                 }
                 if observed.own {
                     conversation.release_asked(&mut self.names, |_| true);
@@ -194,7 +194,7 @@ impl Monitor {
                 rare.undelivered &= !is_certain;
                 if observed.own {
                     // The agent knows its role.
-                    rare.doubtful_roles &= projection.senders_of(observed.act);
+                    rare.uncertain_roles &= projection.senders_of(observed.act);
                     rare.last_sent = Some(last_sent(false, bound_after));
                 } else if rare.local.as_ref().is_none_or(|run| !run.has_last()) {
                     rare.last_sent = None;
@@ -228,7 +228,7 @@ impl Monitor {
                 Err(Denied::Unchecked(Unchecked::BegunElsewhere))
             }
             // The undelivered message has arrived only if the agent has the role that it claims.
-            Err(_) if observed.own && conversation.rare().doubtful => {
+            Err(_) if observed.own && conversation.rare().uncertain => {
                 Err(Denied::Unchecked(Unchecked::UnknownHistory))
             }
             // Another agent may have claimed the role of the sender.
@@ -247,13 +247,13 @@ impl Monitor {
 }
 
 /// Gives a free role to the other side of a message. A sender that the monitored agent knows only from this
-/// message claims the role, and `doubtful` are the roles of the monitored agent that the message excludes.
+/// message claims the role, and `uncertain` are the roles of the monitored agent that the message excludes.
 fn bind(
     conversation: &mut Conversation,
     names: &mut Names,
     observed: &ObservedMessage<'_>,
     role: u8,
-    doubtful: impl FnOnce() -> u32,
+    uncertain: impl FnOnce() -> u32,
 ) {
     let agents = match observed.own {
         true => observed.receivers,
@@ -270,8 +270,8 @@ fn bind(
     let is_asked = rare.asked.iter().any(|asked| asked.role == role);
     if !observed.own && !began && !is_asked {
         rare.claimed = true;
-        rare.doubtful |= rare.undelivered;
-        rare.doubtful_roles |= doubtful();
+        rare.uncertain |= rare.undelivered;
+        rare.uncertain_roles |= uncertain();
     }
     conversation.release_asked(names, |asked| asked == role);
 }

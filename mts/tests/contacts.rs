@@ -64,7 +64,7 @@ impl Contacts for Publishing {
         self.events.lock().push(Event::Published);
     }
 
-    fn doubtful(&self, _: &Location, _: TransportErrorKind) {}
+    fn suspect(&self, _: &Location, _: TransportErrorKind) {}
 
     fn introduced(&self, _: &Introduction) {}
 

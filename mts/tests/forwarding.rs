@@ -113,7 +113,7 @@ impl Gateway {
     /// The next action except contacts.
     fn next(&mut self) -> Option<Action> {
         match self.poll_action() {
-            Some(Action::Heard { .. } | Action::Doubtful { .. }) => self.poll_action(),
+            Some(Action::Heard { .. } | Action::Suspect { .. }) => self.poll_action(),
             other => other,
         }
     }

@@ -37,7 +37,7 @@ impl Contacts for Halting {
 
     fn publish(&self) {}
 
-    fn doubtful(&self, _: &Location, _: TransportErrorKind) {}
+    fn suspect(&self, _: &Location, _: TransportErrorKind) {}
 
     fn introduced(&self, _: &Introduction) {
         let _ = self.called.lock().send(());

@@ -720,7 +720,7 @@ impl Contacts for KnownPeers {
         *published = heard;
     }
 
-    fn doubtful(&self, location: &Location, fault: TransportErrorKind) {
+    fn suspect(&self, location: &Location, fault: TransportErrorKind) {
         self.neighbors.doubt(location, fault);
         if let Some(network) = &*self.network.lock() {
             network.doubt(location.incarnation());

@@ -1,7 +1,7 @@
 //! `fipa ams`: lists the agents of a platform.
 
 use clap::Args;
-use fipa::platform::{Ams, AmsDescription, ApDescription, AgentState};
+use fipa::platform::{AgentState, Ams, AmsDescription, ApDescription};
 use fipa::{Agent, AgentId, Config};
 use fipa_acl::escape;
 use serde_json::{Value, json};

@@ -27,16 +27,16 @@ Examples:
   fipa doctor
   fipa doctor --set transport.shm.capacity=1GiB
   fipa doctor --set 'discovery.interfaces=[\"wlan0\"]'
-  fipa doctor --json | jq -r '.checks[] | select(.verdict != \"fine\") | .advice'
+  fipa doctor --json | jq -r '.checks[] | select(.severity != \"fine\") | .advice'
 
 Verdicts:
   fine      no problem
-  doubtful  works, but may fail under load or later
+  warning  works, but may fail under load or later
   bad       does not work; the exit code is 1
 
 JSON:
-  { \"verdict\": the worst verdict,
-    \"checks\": [ { \"area\", \"check\", \"verdict\", \"found\", \"advice\": unless the verdict is fine } ] }")]
+  { \"severity\": the worst severity,
+    \"checks\": [ { \"area\", \"check\", \"severity\", \"found\", \"advice\": unless the severity is fine } ] }")]
 pub(crate) struct Arguments {
     /// Print JSON
     #[arg(long)]
@@ -47,17 +47,19 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let config = global.config()?;
     let mut checks = examine(&config);
     checks.extend(of_gateway(&config));
-    let worst = checks.iter().map(|check| check.verdict).max();
+    let worst = checks.iter().map(|check| check.severity).max();
     let worst = worst.unwrap_or(Severity::Fine);
     if arguments.json {
-        output::json(&json!({ "verdict": worst, "checks": checks }))?;
+        output::json(&json!({ "severity": worst, "checks": checks }))?;
     } else {
         output::text(&table(&checks))?;
     }
     if worst < Severity::Bad {
         return Ok(());
     }
-    let bad = checks.iter().filter(|check| check.verdict == Severity::Bad);
+    let bad = checks
+        .iter()
+        .filter(|check| check.severity == Severity::Bad);
     let bad: Vec<String> = bad
         .map(|check| format!("{}: {}", check.area, check.check))
         .collect();
@@ -98,15 +100,15 @@ fn table(checks: &[Check]) -> String {
         if let Some(advice) = &check.advice {
             found = format!("{found}\n-> {}", escape(advice));
         }
-        table.add_row([word(check.verdict), check.area, check.check, &found]);
+        table.add_row([word(check.severity), check.area, check.check, &found]);
     }
     format!("{}\n", table.trim_fmt())
 }
 
-fn word(verdict: Severity) -> &'static str {
-    match verdict {
+fn word(severity: Severity) -> &'static str {
+    match severity {
         Severity::Fine => "fine",
-        Severity::Warning => "doubtful",
+        Severity::Warning => "warning",
         _ => "bad",
     }
 }

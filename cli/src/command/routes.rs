@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 use comfy_table::Table;
-use fipa::admin::routes::{Connected, RouteReport, Route, RouteState, Standing};
+use fipa::admin::routes::{Connected, Route, RouteReport, RouteState, Standing};
 use fipa::{Matcher, Query};
 use fipa_acl::{escape, escape_name};
 use serde_json::json;

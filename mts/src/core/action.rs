@@ -79,7 +79,7 @@ pub enum Action {
     },
     /// An attempt at this location, of a known incarnation, failed: the service may have ended
     /// without a goodbye. Reported by gateways only.
-    Doubtful {
+    Suspect {
         /// The location.
         location: Location,
         /// Kind of the failure.

@@ -200,7 +200,7 @@ impl AttemptTable {
         fault: TransportErrorKind,
     ) {
         if self.config.forwards && location.incarnation().is_known() {
-            self.actions.push_back(Action::Doubtful {
+            self.actions.push_back(Action::Suspect {
                 location: location.clone(),
                 fault,
             });

@@ -85,8 +85,8 @@ pub trait Contacts: Send + Sync {
     /// locked, because it may write files.
     fn publish(&self);
 
-    /// A service may be gone; see [`Action::Doubtful`].
-    fn doubtful(&self, location: &Location, fault: TransportErrorKind);
+    /// A service may be gone; see [`Action::Suspect`].
+    fn suspect(&self, location: &Location, fault: TransportErrorKind);
 
     /// A service has introduced itself on a connection; see
     /// [`Sink::introduced`](fipa_transport::Sink::introduced).
@@ -783,9 +783,9 @@ impl Shared {
                 } => {
                     state.outcome(send, receiver, outcome);
                 }
-                Action::Doubtful { location, fault } => {
+                Action::Suspect { location, fault } => {
                     if let Some(contacts) = &self.config.contacts {
-                        contacts.doubtful(&location, fault);
+                        contacts.suspect(&location, fault);
                     }
                 }
                 Action::Heard {

@@ -598,7 +598,7 @@ impl World {
                 Action::Heard { .. }
                 | Action::HeardAgain { .. }
                 | Action::Taken { .. }
-                | Action::Doubtful { .. } => {}
+                | Action::Suspect { .. } => {}
                 Action::Notice(notice) => {
                     let Now { instant, utc } = self.clocks();
                     let watching = &mut self.watching[self.processes[at].host];

@@ -88,12 +88,12 @@ impl Listener {
             // The library may still announce the previous locations.
             self.browser.report_again(&label);
         }
-        let (ended, doubtful) = {
+        let (ended, suspect) = {
             let mut stored = shared.peer_records.lock();
             (stored.take_ended(), stored.due(now))
         };
         self.browser.end(now, &ended);
-        self.browser.doubt(now, &doubtful);
+        self.browser.suspect(now, &suspect);
         let due = self.browser.handle_timeout(now, fastrand::f64());
         self.send(due.packets);
         for fullname in due.gone {
@@ -179,7 +179,7 @@ impl Listener {
             }
             Repair::Surplus(gateway) => shared.peer_records.lock().verify_all(gateway),
             Repair::Silent(gateway) => {
-                shared.peer_records.lock().doubt(Instant::now(), gateway);
+                shared.peer_records.lock().suspect(Instant::now(), gateway);
             }
         }
     }

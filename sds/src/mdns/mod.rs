@@ -197,7 +197,7 @@ impl MdnsDirectory {
             .shared
             .peer_records
             .lock()
-            .doubt(Instant::now(), gateway);
+            .suspect(Instant::now(), gateway);
         if doubted {
             self.shared.postponed.notify_one();
         }

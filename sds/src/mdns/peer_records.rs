@@ -104,7 +104,7 @@ impl PeerRecords {
     /// Doubts the gateway: queues up to `BATCH` of its records for verification first. If it has
     /// more, one of these stands for the rest. Returns false when there are no records, or a doubt
     /// has already started and no record changed since.
-    pub(super) fn doubt(&mut self, now: Instant, gateway: Incarnation) -> bool {
+    pub(super) fn suspect(&mut self, now: Instant, gateway: Incarnation) -> bool {
         let Some(known) = self.gateways.get_mut(&gateway) else {
             return false;
         };
@@ -259,8 +259,8 @@ mod tests {
         for number in 0..60 {
             put(&mut holdings, now, number, 7, true);
         }
-        assert!(holdings.doubt(now, gateway));
-        assert!(!holdings.doubt(now, gateway));
+        assert!(holdings.suspect(now, gateway));
+        assert!(!holdings.suspect(now, gateway));
         // The first batch is queried at once.
         let verified = holdings.due(now);
         assert_eq!(verified.len(), BATCH);
@@ -288,7 +288,7 @@ mod tests {
             "the records that were not queried yet"
         );
         // After the doubt, the end of a record affects no others.
-        assert!(holdings.doubt(now, gateway));
+        assert!(holdings.suspect(now, gateway));
         let doubted = holdings.due(now + PAUSE);
         now += DOUBT;
         put(&mut holdings, now, doubted[0].parse().unwrap(), 7, false);
@@ -300,14 +300,14 @@ mod tests {
         let mut holdings = PeerRecords::default();
         let (start, gateway) = (Instant::now(), Incarnation::from_u64(7));
         put(&mut holdings, start, 1, 7, true);
-        assert!(holdings.doubt(start, gateway));
-        assert!(!holdings.doubt(start + AGAIN, gateway), "nothing changed");
+        assert!(holdings.suspect(start, gateway));
+        assert!(!holdings.suspect(start + AGAIN, gateway), "nothing changed");
         // The gateway moves, and answers for its record.
         let moved = start + Duration::from_millis(300);
         put(&mut holdings, moved, 1, 7, true);
-        assert!(!holdings.doubt(start + AGAIN / 2, gateway), "too early");
-        assert!(holdings.doubt(start + AGAIN, gateway));
-        assert!(!holdings.doubt(start + 2 * AGAIN, gateway), "unchanged");
+        assert!(!holdings.suspect(start + AGAIN / 2, gateway), "too early");
+        assert!(holdings.suspect(start + AGAIN, gateway));
+        assert!(!holdings.suspect(start + 2 * AGAIN, gateway), "unchanged");
     }
 
     #[test]
@@ -320,7 +320,7 @@ mod tests {
         for round in 0..100 {
             let now = start + 2 * DOUBT * round;
             for gateway in 1..=10 {
-                assert!(holdings.doubt(now, Incarnation::from_u64(gateway)));
+                assert!(holdings.suspect(now, Incarnation::from_u64(gateway)));
             }
         }
         assert!(holdings.queue.len() <= 2 * 250 + BATCH);

@@ -170,13 +170,13 @@ fn namesakes(report: &RouteReport, found: &Namesakes) -> Check {
         false => format!("several gateways have the name {name}: {at}"),
     };
     // Without keys, any host can claim a name.
-    let verdict = match found.is_proved {
+    let severity = match found.is_proved {
         true => Severity::Bad,
         false => Severity::Warning,
     };
     AREA.problem(
         NAMESAKES,
-        verdict,
+        severity,
         text,
         "set mts.name on all but one of the hosts to names of their own, and restart their gateways; a host with \
          keys then needs new ones (`fipa keys init` in an empty directory). Until then, lists and logs do not tell \
@@ -236,12 +236,12 @@ mod tests {
     fn values_that_differ_from_those_of_the_gateway_are_listed() {
         let config = Config::for_host("sherpa");
         let same = configuration(&config, &report(&config));
-        assert_eq!(same.verdict, Severity::Fine, "{}", same.found);
+        assert_eq!(same.severity, Severity::Fine, "{}", same.found);
         let mut other = Config::for_host("sherpa");
         other.security.loopback = true;
         other.mts.queue = 7;
         let differs = configuration(&config, &report(&other));
-        assert_eq!(differs.verdict, Severity::Warning);
+        assert_eq!(differs.severity, Severity::Warning);
         let expected = "sherpa runs with other values: mts.queue = 7 (here: 256); security.loopback = true \
                         (here: false)";
         assert_eq!(differs.found, expected);
@@ -257,7 +257,7 @@ mod tests {
         });
         let mut checks = Vec::new();
         examine(&config, Ok(&report), &mut checks);
-        let listed = checks.iter().find(|check| check.verdict != Severity::Fine);
+        let listed = checks.iter().find(|check| check.severity != Severity::Fine);
         let found = &listed.unwrap().found;
         assert!(
             found.starts_with("the agent arm is also registered at the gateway crex:"),
@@ -289,7 +289,7 @@ mod tests {
         examine(&config, Ok(&report), &mut checks);
         let of = |name| {
             let checks = checks.iter().filter(move |check| check.check == name);
-            let checks = checks.map(|check| (check.verdict, check.found.as_str()));
+            let checks = checks.map(|check| (check.severity, check.found.as_str()));
             checks.collect::<Vec<_>>()
         };
         let [(Severity::Warning, refused)] = of(REFUSED_DIALS)[..] else {
@@ -313,10 +313,10 @@ mod tests {
     }
 
     #[test]
-    fn a_gateway_that_does_not_answer_is_doubtful() {
+    fn a_gateway_that_does_not_answer_is_a_warning() {
         let mut checks = Vec::new();
         examine(&Config::for_host("sherpa"), Err("no answer"), &mut checks);
         assert_eq!(checks.len(), 1);
-        assert_eq!(checks[0].verdict, Severity::Warning);
+        assert_eq!(checks[0].severity, Severity::Warning);
     }
 }

@@ -33,16 +33,16 @@ pub struct Check {
     pub area: &'static str,
     /// The name of the check, for example `size of /dev/shm`.
     pub check: &'static str,
-    /// The verdict.
-    pub verdict: Severity,
+    /// The severity.
+    pub severity: Severity,
     /// The state that was found, as text.
     pub found: String,
-    /// The remedy; `None` if the verdict is [`Severity::Fine`].
+    /// The remedy; `None` if the severity is [`Severity::Fine`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub advice: Option<String>,
 }
 
-/// The verdict of a check, ordered from best to worst.
+/// The severity of a check, ordered from best to worst.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -104,7 +104,7 @@ impl Area {
         Check {
             area: self.0,
             check,
-            verdict: Severity::Fine,
+            severity: Severity::Fine,
             found: found.into(),
             advice: None,
         }
@@ -113,12 +113,12 @@ impl Area {
     pub(crate) fn problem(
         &self,
         check: &'static str,
-        verdict: Severity,
+        severity: Severity,
         found: impl Into<String>,
         advice: impl Into<String>,
     ) -> Check {
         Check {
-            verdict,
+            severity,
             advice: Some(advice.into()),
             ..self.fine(check, found)
         }

@@ -44,8 +44,8 @@ fn multicast(found: &Multicast) -> Check {
         interface, address, ..
     } = found;
     let at = format!("{interface} ({address})");
-    let problem = |verdict, found: &str, advice: &str| {
-        AREA.problem(MULTICAST, verdict, format!("{at}: {found}"), advice)
+    let problem = |severity, found: &str, advice: &str| {
+        AREA.problem(MULTICAST, severity, format!("{at}: {found}"), advice)
     };
     if let Some(error) = &found.error {
         let found = format!("multicast cannot be used: {error}");

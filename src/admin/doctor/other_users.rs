@@ -137,10 +137,10 @@ mod tests {
         let found = others(&shm, &tmp, owner.wrapping_add(1));
         assert_eq!(found.len(), 1);
         let same = report(&found, "default");
-        assert_eq!(same.verdict, Severity::Warning);
+        assert_eq!(same.severity, Severity::Warning);
         let expected = format!("{} runs a domain `default` here", user_name(owner));
         assert!(same.found.starts_with(&expected), "{}", same.found);
-        assert_eq!(report(&found, "another").verdict, Severity::Fine);
+        assert_eq!(report(&found, "another").severity, Severity::Fine);
         fs::remove_file(shm.join("fipa_default_0123abcd_x")).unwrap();
         let unnamed = report(&others(&shm, &tmp, owner.wrapping_add(1)), "default");
         assert!(

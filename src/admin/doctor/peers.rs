@@ -55,13 +55,13 @@ pub(super) fn connect_all(
 
 fn check(title: &'static str, name: &str, address: &str) -> Check {
     let found = |what: &str| format!("{name}, tcp://{address}: {what}");
-    let doubtful =
+    let warning =
         |what: &str, advice: String| AREA.problem(title, Severity::Warning, found(what), advice);
     match connect(address) {
         Ok(()) => AREA.fine(title, found("accepts connections")),
         Err(error) if error.kind() == io::ErrorKind::TimedOut => {
             let port = address.rsplit(':').next().unwrap_or_default();
-            doubtful(
+            warning(
                 &format!("nothing answered for {} s", TIMEOUT.as_secs()),
                 format!(
                     "check that a firewall there lets it in (for example: sudo ufw allow {port}/tcp), and \
@@ -69,12 +69,12 @@ fn check(title: &'static str, name: &str, address: &str) -> Check {
                 ),
             )
         }
-        Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => doubtful(
+        Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => warning(
             "the host answers, but no process listens on this port",
             "start `fipa up` there, with this port and an address of that host in transport.tcp.listen"
                 .to_owned(),
         ),
-        Err(error) => doubtful(
+        Err(error) => warning(
             &format!("cannot be reached: {error}"),
             "check the address in discovery.static, and the network (`ip route`)".to_owned(),
         ),
@@ -104,12 +104,12 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap().to_string();
         let open = check(PORTS, "crex", &address);
-        assert_eq!(open.verdict, Severity::Fine, "{}", open.found);
+        assert_eq!(open.severity, Severity::Fine, "{}", open.found);
         let wrong = check(PORTS, "crex", "name without port");
-        assert_eq!(wrong.verdict, Severity::Warning);
+        assert_eq!(wrong.severity, Severity::Warning);
         drop(listener);
         let closed = check(PORTS, "crex", &address);
-        assert_eq!(closed.verdict, Severity::Warning, "{}", closed.found);
+        assert_eq!(closed.severity, Severity::Warning, "{}", closed.found);
         assert!(
             closed.found.contains("no process listens"),
             "{}",

@@ -51,12 +51,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_queue_larger_than_available_memory_is_doubtful() {
+    fn a_queue_larger_than_available_memory_is_a_warning() {
         let config = Config::for_host("sherpa");
-        assert_eq!(queues(&config, None).verdict, Severity::Fine);
-        assert_eq!(queues(&config, Some(1 << 30)).verdict, Severity::Fine);
+        assert_eq!(queues(&config, None).severity, Severity::Fine);
+        assert_eq!(queues(&config, Some(1 << 30)).severity, Severity::Fine);
         let small = queues(&config, Some(1 << 20));
-        assert_eq!(small.verdict, Severity::Warning);
+        assert_eq!(small.severity, Severity::Warning);
         assert!(small.found.contains("64.0 MiB"), "{}", small.found);
     }
 

@@ -68,12 +68,12 @@ fn keys(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
         let (Some(problem), Some(advice)) = (holding.told(), holding.advice(now, whose)) else {
             return;
         };
-        let verdict = match holding {
+        let severity = match holding {
             Holding::EndsSoon => Severity::Warning,
             _ => Severity::Bad,
         };
         let found = format!("the certificate of {name} {problem}");
-        checks.push(AREA.problem(KEYS, verdict, found, advice));
+        checks.push(AREA.problem(KEYS, severity, found, advice));
     };
     ending("this host", &credentials.own, Whose::Own);
     for trusted in &credentials.trusted {
@@ -92,30 +92,32 @@ mod tests {
     use super::*;
     use crate::admin::keys::{Keys, VALID};
 
-    fn verdicts(config: &Config) -> Vec<(Severity, String)> {
-        verdicts_at(SystemTime::now(), config)
+    fn severities(config: &Config) -> Vec<(Severity, String)> {
+        severities_at(SystemTime::now(), config)
     }
 
-    fn verdicts_at(now: SystemTime, config: &Config) -> Vec<(Severity, String)> {
+    fn severities_at(now: SystemTime, config: &Config) -> Vec<(Severity, String)> {
         let mut checks = Vec::new();
         examine(now, config, &mut checks);
-        let verdicts = checks.into_iter().map(|check| (check.verdict, check.found));
-        verdicts.collect()
+        let severities = checks
+            .into_iter()
+            .map(|check| (check.severity, check.found));
+        severities.collect()
     }
 
     #[test]
     fn configurations_that_accept_no_host_or_every_host_are_reported() {
         let mut config = Config::for_host("sherpa");
-        assert_eq!(verdicts(&config)[0].0, Severity::Fine);
+        assert_eq!(severities(&config)[0].0, Severity::Fine);
         config.security.insecure = true;
-        assert_eq!(verdicts(&config)[0].0, Severity::Warning);
+        assert_eq!(severities(&config)[0].0, Severity::Warning);
         config.security.insecure = false;
         let dir = tempfile::tempdir().unwrap();
         config.security.keys = dir.path().display().to_string();
-        assert_eq!(verdicts(&config)[0].0, Severity::Bad, "no keys there");
+        assert_eq!(severities(&config)[0].0, Severity::Bad, "no keys there");
         let keys = Keys::at(dir.path());
         keys.init(&config.mts.name, &[], VALID).unwrap();
-        let found = verdicts(&config);
+        let found = severities(&config);
         assert_eq!(found.len(), 1);
         assert!(found[0].1.contains("no other host is trusted"));
         let other = tempfile::tempdir().unwrap();
@@ -123,7 +125,7 @@ mod tests {
         other.init("crex-mts", &[], VALID / 1000).unwrap();
         keys.trust(&std::fs::read(other.own_file()).unwrap())
             .unwrap();
-        let found = verdicts(&config);
+        let found = severities(&config);
         assert_eq!(found.len(), 1);
         assert_eq!(found[0].0, Severity::Warning);
         assert!(
@@ -133,7 +135,7 @@ mod tests {
         );
         config.mts.name = "another".to_owned();
         assert!(
-            verdicts(&config)
+            severities(&config)
                 .iter()
                 .any(|found| found.0 == Severity::Bad)
         );
@@ -153,33 +155,33 @@ mod tests {
         keys.trust(&std::fs::read(other.own_file()).unwrap())
             .unwrap();
         let made = SystemTime::now();
-        let at = |now| match verdicts_at(now, &config).as_slice() {
-            [(verdict, found)] => (*verdict, found.clone()),
+        let at = |now| match severities_at(now, &config).as_slice() {
+            [(severity, found)] => (*severity, found.clone()),
             found => panic!("{found:?}"),
         };
         assert_eq!(at(made + 69 * DAY).0, Severity::Fine);
         for days in [71, 99] {
-            let (verdict, found) = at(made + days * DAY);
-            assert_eq!(verdict, Severity::Warning, "after {days} days");
+            let (severity, found) = at(made + days * DAY);
+            assert_eq!(severity, Severity::Warning, "after {days} days");
             assert!(found.contains("crex-mts expires within 30 days"), "{found}");
         }
-        let (verdict, found) = at(made + 101 * DAY);
-        assert_eq!(verdict, Severity::Bad);
+        let (severity, found) = at(made + 101 * DAY);
+        assert_eq!(severity, Severity::Bad);
         assert!(found.contains("crex-mts has expired"), "{found}");
         // Keys begin a day before they are made, because clocks differ.
         assert_eq!(at(made - DAY / 2).0, Severity::Fine);
         for wrong in [made - 2 * DAY, SystemTime::UNIX_EPOCH] {
-            let found = verdicts_at(wrong, &config);
+            let found = severities_at(wrong, &config);
             assert_eq!(found.len(), 2, "{found:?}");
-            for (verdict, found) in found {
-                assert_eq!(verdict, Severity::Bad);
+            for (severity, found) in found {
+                assert_eq!(severity, Severity::Bad);
                 let cause = "is not valid yet by the clock of this host";
                 assert!(found.contains(cause), "{found}");
             }
             assert_clock_comes_first(wrong, &config);
         }
         // Both certificates.
-        assert_eq!(verdicts_at(made + 2 * VALID, &config).len(), 2);
+        assert_eq!(severities_at(made + 2 * VALID, &config).len(), 2);
         assert_clock_comes_first(made + 2 * VALID, &config);
     }
 

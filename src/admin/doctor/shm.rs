@@ -25,10 +25,10 @@ const DESCRIPTORS_PER_PEER: u64 = 10;
 /// Bytes of shared memory that a connection between two processes takes.
 const PER_CONNECTION: u64 = 1 << 20;
 
-/// Number of peer processes below which the limit of descriptors is doubtful.
+/// Number of peer processes below which the limit of descriptors is a warning.
 const FEW_PEERS: u64 = 32;
 
-/// Number of inotify instances (one per process) below which the limit is doubtful.
+/// Number of inotify instances (one per process) below which the limit is a warning.
 const FEW_INSTANCES: u64 = 64;
 
 /// The lowest user identifier that is not of a system user; systemd's RemoveIPC applies from here on.
@@ -217,22 +217,22 @@ mod tests {
         assert_eq!(remove_ipc(root, 1000), None);
         fs::create_dir_all(root.join("run/systemd/system")).unwrap();
         fs::create_dir_all(root.join("etc/systemd/logind.conf.d")).unwrap();
-        let verdict = |user| remove_ipc(root, user).unwrap().verdict;
-        assert_eq!(verdict(1000), Severity::Warning);
-        assert_eq!(verdict(0), Severity::Fine);
+        let severity = |user| remove_ipc(root, user).unwrap().severity;
+        assert_eq!(severity(1000), Severity::Warning);
+        assert_eq!(severity(0), Severity::Fine);
         let main = root.join("etc/systemd/logind.conf");
         fs::write(&main, "[Login]\n#RemoveIPC=yes\nRemoveIPC=no\n").unwrap();
-        assert_eq!(verdict(1000), Severity::Fine);
+        assert_eq!(severity(1000), Severity::Fine);
         let part = root.join("etc/systemd/logind.conf.d/50-robot.conf");
         fs::write(part, "[Login]\nRemoveIPC=yes\n").unwrap();
-        assert_eq!(verdict(1000), Severity::Warning);
+        assert_eq!(severity(1000), Severity::Warning);
     }
 
     #[test]
     fn a_lack_of_inotify_instances_names_the_sysctl() {
-        assert_eq!(instances_left(128, true).verdict, Severity::Fine);
+        assert_eq!(instances_left(128, true).severity, Severity::Fine);
         for lacking in [instances_left(128, false), instances_left(16, true)] {
-            assert_eq!(lacking.verdict, Severity::Warning);
+            assert_eq!(lacking.severity, Severity::Warning);
             let advice = lacking.advice.unwrap();
             assert!(advice.contains("fs.inotify.max_user_instances"), "{advice}");
         }
@@ -246,13 +246,13 @@ mod tests {
             used,
             ..Inspection::default()
         };
-        let verdict = |found| size(&found, 256 << 20).verdict;
-        assert_eq!(verdict(found(1 << 30, 1 << 29, 0)), Severity::Fine);
-        assert_eq!(verdict(found(64 << 20, 64 << 20, 0)), Severity::Warning);
-        assert_eq!(verdict(found(1 << 30, 1 << 20, 0)), Severity::Bad);
+        let severity = |found| size(&found, 256 << 20).severity;
+        assert_eq!(severity(found(1 << 30, 1 << 29, 0)), Severity::Fine);
+        assert_eq!(severity(found(64 << 20, 64 << 20, 0)), Severity::Warning);
+        assert_eq!(severity(found(1 << 30, 1 << 20, 0)), Severity::Bad);
         // Memory that the domain has taken already counts as usable by it.
         assert_eq!(
-            verdict(found(300 << 20, 100 << 20, 200 << 20)),
+            severity(found(300 << 20, 100 << 20, 200 << 20)),
             Severity::Fine
         );
     }
@@ -261,7 +261,7 @@ mod tests {
     fn files_open_to_other_users_and_leftovers_are_reported() {
         let fine = Inspection::default();
         assert_eq!(
-            (leftovers(&fine).verdict, exposed(&fine).verdict),
+            (leftovers(&fine).severity, exposed(&fine).severity),
             (Severity::Fine, Severity::Fine)
         );
         let found = Inspection {
@@ -270,7 +270,7 @@ mod tests {
             ..Inspection::default()
         };
         assert_eq!(
-            (leftovers(&found).verdict, exposed(&found).verdict),
+            (leftovers(&found).severity, exposed(&found).severity),
             (Severity::Warning, Severity::Bad)
         );
         assert!(

@@ -323,8 +323,8 @@ impl Keys {
     /// # Errors
     /// If one cannot be read, or is also revoked.
     pub fn trusted(&self) -> Result<Vec<Certificate>, KeysError> {
-        let (confirmed, mut doubtful) = self.confirmed();
-        match doubtful.pop() {
+        let (confirmed, mut unconfirmed) = self.confirmed();
+        match unconfirmed.pop() {
             None => Ok(confirmed),
             Some(error) => Err(error),
         }
@@ -333,13 +333,13 @@ impl Keys {
     /// Reads the certificates of trusted peers, in that order, and collects the errors of those that
     /// cannot be read. Those must not be trusted, because they may be revoked ones.
     pub(crate) fn confirmed(&self) -> (Vec<Certificate>, Vec<KeysError>) {
-        let (all, mut doubtful) = self.all("trusted");
+        let (all, mut unconfirmed) = self.all("trusted");
         let (revoked, confirmed) = all
             .into_iter()
             .partition::<Vec<_>, _>(|it| self.file("revoked", it.fingerprint()).exists());
         let revoked = revoked.iter().map(Certificate::fingerprint);
-        doubtful.extend(revoked.map(KeysError::Revoked));
-        (confirmed, doubtful)
+        unconfirmed.extend(revoked.map(KeysError::Revoked));
+        (confirmed, unconfirmed)
     }
 
     /// Reads the revoked certificates.
@@ -347,8 +347,8 @@ impl Keys {
     /// # Errors
     /// If one cannot be read.
     pub fn revoked(&self) -> Result<Vec<Certificate>, KeysError> {
-        let (revoked, mut doubtful) = self.all("revoked");
-        match doubtful.pop() {
+        let (revoked, mut unconfirmed) = self.all("revoked");
+        match unconfirmed.pop() {
             None => Ok(revoked),
             Some(error) => Err(error),
         }
@@ -400,7 +400,7 @@ impl Keys {
     /// # Errors
     /// If no certificate matches, or if several match a fingerprint.
     pub fn trusted_as(&self, which: &str) -> Result<Vec<Certificate>, KeysError> {
-        let (trusted, mut doubtful) = self.confirmed();
+        let (trusted, mut unconfirmed) = self.confirmed();
         let begins = |certificate: &Certificate| {
             let fingerprint = certificate.fingerprint().to_string();
             which.len() >= 8 && fingerprint.starts_with(which)
@@ -415,7 +415,7 @@ impl Keys {
             if meant.len() != 1 {
                 let (which, found) = (which.to_owned(), meant.len());
                 // The certificate that cannot be read may be the one to revoke.
-                let unread = doubtful.pop().filter(|_| found == 0);
+                let unread = unconfirmed.pop().filter(|_| found == 0);
                 return Err(unread.unwrap_or(KeysError::Which { which, found }));
             }
         }

@@ -219,8 +219,8 @@ fn a_certificate_that_other_users_can_write_is_not_trusted() {
         chmod(mode);
         assert!(matches!(rover.trusted(), Err(KeysError::Writable(path)) if path == file));
         assert!(rover.credentials().is_err());
-        let (confirmed, doubtful) = rover.confirmed();
-        assert_eq!((confirmed.len(), doubtful.len()), (0, 1));
+        let (confirmed, unconfirmed) = rover.confirmed();
+        assert_eq!((confirmed.len(), unconfirmed.len()), (0, 1));
     }
     chmod(0o644);
     assert_eq!(rover.trusted().unwrap(), std::slice::from_ref(&made));

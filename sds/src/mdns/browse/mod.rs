@@ -466,7 +466,7 @@ impl Browser {
     }
 
     /// Queries for these records; a record that is not confirmed in time is removed.
-    pub(super) fn doubt(&mut self, now: Instant, fullnames: &[Arc<str>]) {
+    pub(super) fn suspect(&mut self, now: Instant, fullnames: &[Arc<str>]) {
         for fullname in fullnames {
             let Some(known) = self.records.get_mut(label_of(fullname)) else {
                 continue;

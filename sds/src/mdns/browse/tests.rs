@@ -225,7 +225,7 @@ fn a_doubted_record_is_confirmed_or_removed() {
     let start = Instant::now();
     let mut browser = browser(start, &["arm", "leg"]);
     let doubted = ["arm", "leg"].map(|label| format!("{label}.{SERVICE_TYPE}").into());
-    browser.doubt(start, &doubted);
+    browser.suspect(start, &doubted);
     let (questions, _) = run_timers(&mut browser, start, 0.5);
     assert_eq!(questions.len(), 4, "{questions:?}");
     let now = start + seconds(0.5);
@@ -237,7 +237,7 @@ fn a_doubted_record_is_confirmed_or_removed() {
     assert_eq!(gone, [20]);
     // A beacon is not an answer.
     browser.belongs(&doubted[1], OTHER);
-    browser.doubt(now, &doubted);
+    browser.suspect(now, &doubted);
     browser.confirm(now + seconds(0.1), OTHER);
     let (_, gone) = run_timers(&mut browser, start, 5.0);
     assert_eq!(gone, [25]);
