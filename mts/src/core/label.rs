@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_transport::{Body, Parcel, Stream};
+use fipa_transport::Stream;
 
 /// A parcel without its body.
 #[derive(Debug)]
@@ -14,27 +14,4 @@ pub(super) struct Label {
     pub(super) after: u64,
     pub(super) transfer: u64,
     pub(super) remaining: Duration,
-}
-
-impl Label {
-    pub(super) fn of(parcel: Parcel) -> (Self, Body) {
-        let Parcel {
-            receiver,
-            stream,
-            sequence,
-            after,
-            transfer,
-            remaining,
-            body,
-        } = parcel;
-        let label = Self {
-            receiver,
-            stream,
-            sequence,
-            after,
-            transfer,
-            remaining,
-        };
-        (label, body)
-    }
 }

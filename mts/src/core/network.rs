@@ -51,7 +51,7 @@ impl Core {
             .cloned()
             .collect();
         for location in &left {
-            self.table.routes.left(location);
+            self.table.routes.service_left(location);
         }
         left
     }

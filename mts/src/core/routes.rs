@@ -36,7 +36,7 @@ const MAX_HEALTH: usize = 4096;
 
 impl Routes {
     /// Records a location that its service has left for another one.
-    pub(super) fn left(&mut self, location: &Location) {
+    pub(super) fn service_left(&mut self, location: &Location) {
         self.left.retain(|other| other != location);
         if self.left.len() >= MAX_LEFT {
             self.left.pop_front();
@@ -45,7 +45,7 @@ impl Routes {
     }
 
     /// Whether the service at this location has recently left it for another one.
-    pub(crate) fn has_left(&self, location: &Location) -> bool {
+    pub(crate) fn service_has_left(&self, location: &Location) -> bool {
         self.left.contains(location)
     }
 

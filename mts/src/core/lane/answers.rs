@@ -14,7 +14,7 @@ use super::super::origin::Settlement;
 use super::super::rules::{self, AttemptEnd, Belief, Cause, CustodyReport};
 use super::super::tally::Tally;
 use super::custody::ASK_CUSTODIAN_AFTER;
-use super::delivery::{Departure, State};
+use super::open_letter::{Departure, State};
 use super::{CONGESTED_TRIES, ENDED_TIMEOUT, Lane, LaneKey, MOVING_TIMEOUT};
 
 impl Lane {
@@ -518,7 +518,8 @@ impl Lane {
         let service = location.incarnation();
         let stands = |route: &Location| route.incarnation() == service;
         let is_there = entry.locations.iter().any(stands);
-        let has_left = || table.routes.has_left(location) && !entry.locations.contains(location);
+        let has_left =
+            || table.routes.service_has_left(location) && !entry.locations.contains(location);
         let is_under_way = matches!(delivery.progress.state, State::UnderWay { .. });
         if !service.is_known() || (is_there && !(is_under_way && has_left())) {
             return;

@@ -6,7 +6,7 @@ use fipa_transport::{FailureReason, TransportError, TransportErrorKind};
 
 use super::super::attempts::AttemptTable;
 use super::super::work;
-use super::delivery::{Holding, State};
+use super::open_letter::{Holding, State};
 use super::{ENDED_AT_ONCE, ENDED_TIMEOUT, Lane};
 
 impl Lane {

@@ -15,7 +15,7 @@ use super::super::origin::{Settlement, Upstream};
 use super::super::rules::{self, AttemptEnd, Cause, HoldDecision};
 use super::super::work;
 use super::Lane;
-use super::delivery::{Holding, OpenLetter, State};
+use super::open_letter::{Holding, OpenLetter, State};
 use super::pause::PauseEnd;
 use super::turns::Pace;
 

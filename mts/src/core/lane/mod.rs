@@ -18,7 +18,7 @@
 mod answers;
 mod clock;
 mod custody;
-mod delivery;
+mod open_letter;
 mod pause;
 mod tried;
 mod trust;
@@ -35,8 +35,8 @@ use fipa_transport::{
 };
 
 use self::custody::LettersLeft;
-pub(crate) use self::delivery::OpenLetter;
-use self::delivery::State;
+pub(crate) use self::open_letter::OpenLetter;
+use self::open_letter::State;
 use self::pause::Pause;
 pub(crate) use self::pause::PauseEnd;
 use super::attempts::{AttemptTable, Purpose};

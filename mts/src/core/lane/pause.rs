@@ -11,7 +11,7 @@ use fipa_transport::Hop;
 use super::super::attempts::AttemptTable;
 use super::super::rules::{self, Again, Cause};
 use super::Lane;
-use super::delivery::{State, is_of};
+use super::open_letter::{State, is_of};
 
 /// Pauses between rounds over all routes, and before a returned letter is dispatched again.
 const FIRST_PAUSE: Duration = Duration::from_millis(10);

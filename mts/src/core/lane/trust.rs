@@ -10,7 +10,7 @@ use super::super::attempts::AttemptTable;
 use super::super::rules::AttemptEnd;
 use super::super::work;
 use super::Lane;
-use super::delivery::State;
+use super::open_letter::State;
 
 impl Lane {
     /// Handles a change of the services whose certificate is no longer trusted.
