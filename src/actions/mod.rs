@@ -91,6 +91,8 @@ pub use fipa_actions::{
 pub use fipa_content::Term;
 pub use offer::{Action, Offer, OfferError};
 
-pub use crate::actions::table::Execution;
+pub use self::table::Execution;
+#[cfg(doc)]
+use crate::Agent;
 #[cfg(doc)]
 use crate::protocol::DialogueError;

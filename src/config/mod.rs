@@ -156,7 +156,7 @@ pub struct MtsConfig {
 pub struct RouteConfig {
     /// The name of a receiver, or a [`fipa_sds::Pattern`] that is matched against the whole name.
     pub receiver: String,
-    /// The order of transports for these receivers. Transports that are not in [`Mts::transports`] are
+    /// The order of transports for these receivers. Transports that are not in [`MtsConfig::transports`] are
     /// ignored; at least one must be in it.
     pub transports: Vec<Kind>,
 }

@@ -42,7 +42,7 @@ pub trait Transport: Send + Sync + 'static {
     /// The kind of this transport. Locations of this kind are posted to it.
     fn kind(&self) -> Kind;
 
-    /// Maximum length of a letter in bytes. A longer one fails with [`TransportErrorKind::TooLarge`].
+    /// Maximum length of a letter in bytes. A longer one fails with [`TransportErrorKind::TooLarge`](crate::TransportErrorKind::TooLarge).
     fn max_letter(&self) -> usize;
 
     /// Starts to listen and passes all arrivals to `sink`. Called once, before all other methods.

@@ -27,7 +27,7 @@ impl Core {
     }
 
     /// Handles a parcel whose letter the [reader](Self::reader) of this core has
-    /// [read](LetterReader::read_arrival) before the core was locked. A gateway refuses a letter that
+    /// [read](super::LetterReader::read_arrival) before the core was locked. A gateway refuses a letter that
     /// was not read, and so does a core with a gate.
     pub fn handle_read_arrival(
         &mut self,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use fipa_sds::Entry;
 use fipa_transport::{Incarnation, Stream};
 
-/// Identifies a call of [`Core::submit`] in its outcomes.
+/// Identifies a call of [`Core::submit`](super::Core::submit) in its outcomes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct SubmissionId(pub u64);
 

@@ -21,7 +21,7 @@ impl Core {
 
     /// Handles an entry that left the directory or was replaced by another of the same name. Must
     /// be called before [`handle_directory_change`](Self::handle_directory_change). For 30 s a
-    /// gateway answers letters for an agent that left its host with [`Answer::Moved`].
+    /// gateway answers letters for an agent that left its host with [`Answer::Moved`](fipa_transport::Answer::Moved).
     pub fn handle_departure(&mut self, now: Now, entry: &Entry) {
         if self.table.config.forwards {
             self.table.departed.left(now.instant, entry);

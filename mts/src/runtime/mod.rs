@@ -383,7 +383,7 @@ impl Mts {
         self.begin(|core, now| core.submit(now, submission))
     }
 
-    /// Sends a letter to agents, as [`send`](Self::send) does.
+    /// Sends a letter to agents, as [`submit`](Self::submit) does.
     pub fn submit_to_agents(
         &self,
         sender: Incarnation,
@@ -467,7 +467,7 @@ impl Mts {
         })
     }
 
-    /// Sends a letter to exactly this incarnation of an agent; see [`Core::send_to`].
+    /// Sends a letter to exactly this incarnation of an agent; see [`Core::submit_to`].
     pub fn submit_to(&self, submission: Submission, entry: &Entry) -> Sending {
         self.begin(|core, now| (core.submit_to(now, submission, entry), Some(1)))
     }
