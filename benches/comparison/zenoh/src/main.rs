@@ -17,7 +17,7 @@ use zenoh::shm::{
 };
 use zenoh::{Config, Session, Wait as _};
 
-#[path = "../../../benches/src/part/orders.rs"]
+#[path = "../../../src/part/orders.rs"]
 mod orders;
 
 /// Run the zenoh sender or receiver of a measurement; `fipa bench --zenoh` starts this program
