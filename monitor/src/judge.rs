@@ -4,6 +4,8 @@
 use std::borrow::Cow;
 use std::collections::HashMap;
 
+use fipa_acl::is_pattern;
+
 use crate::act::{Act, FAILURE, INFORM};
 use crate::conversation::{
     AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, Conversation, ELSEWHERE, FAILED, NONE, NextState,
@@ -100,11 +102,6 @@ pub(crate) fn judge(
         }
         Scope::Conversation => judge.per_conversation(moves),
     }
-}
-
-/// Whether a receiver is a pattern of names: the members of the multicast are unknown.
-fn is_pattern(receiver: &str) -> bool {
-    receiver.contains(['*', '+', '?', '[', '(', '{', '|', '^', '$', '\\'])
 }
 
 struct Judge<'a> {

@@ -19,7 +19,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use bytesize::ByteSize;
-use fipa_transport::log_limit;
+use fipa_transport::{fnv1a, log_limit};
 use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
@@ -294,11 +294,11 @@ impl DomainDir {
         expect(dead_code, reason = "there is no shared memory")
     )]
     pub(crate) fn prefix(&self) -> String {
-        format!(
-            "fipa_{}_{:08x}",
-            self.domain,
-            fnv(self.path().as_os_str().as_encoded_bytes())
-        )
+        let path = self.path();
+        let path = path.as_os_str().as_encoded_bytes();
+        // Half of the hash, since names of files in shared memory are short.
+        let hash = fnv1a(path.iter().copied()) as u32;
+        format!("fipa_{}_{hash:08x}", self.domain)
     }
 
     /// Returns the identifier of this host: the boot identifier of the kernel, and device and inode
@@ -345,12 +345,6 @@ impl DomainDir {
         }
         remove(self.path());
     }
-}
-
-/// Computes the 32-bit FNV-1a hash, which is short and the same in every version of this program.
-fn fnv(bytes: &[u8]) -> u32 {
-    let step = |hash: u32, byte: &u8| (hash ^ u32::from(*byte)).wrapping_mul(0x0100_0193);
-    bytes.iter().fold(0x811c_9dc5, step)
 }
 
 /// Opens a directory and takes a shared lock on it.

@@ -18,6 +18,7 @@
 pub mod conformance;
 mod error;
 mod faulty;
+mod fnv;
 mod incarnation;
 mod location;
 pub mod log_limit;
@@ -34,6 +35,7 @@ pub mod wire;
 
 pub use error::{ListenError, TransportError, TransportErrorKind};
 pub use faulty::{Fault, Faulty};
+pub use fnv::fnv1a;
 pub use incarnation::{Incarnation, IncarnationError};
 pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use fipa_sds::Entry;
-use fipa_transport::{Incarnation, Stream};
+use fipa_transport::{Incarnation, Stream, fnv1a};
 
 /// Identifies a call of [`Core::submit`](super::Core::submit) in its outcomes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -36,9 +36,7 @@ pub(crate) fn registration_of(entry: &Entry) -> Incarnation {
     }
 }
 
-/// The 64-bit FNV-1a hash: equal in every process, so that reports match their letters.
+/// Equal in every process, so that reports match their letters.
 pub(super) fn registration_by_name(name: &str) -> Incarnation {
-    let step = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
-    let hash = name.as_bytes().iter().fold(0xcbf2_9ce4_8422_2325, step);
-    Incarnation::from_u64(hash.max(1))
+    Incarnation::from_u64(fnv1a(name.bytes()).max(1))
 }

@@ -19,7 +19,7 @@
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, fnv1a};
 use simple_dns::rdata::{PTR, RData, TXT};
 use simple_dns::{CLASS, Label, Name, Packet, PacketFlag, ResourceRecord};
 
@@ -53,14 +53,12 @@ pub(super) struct Digest {
 impl Digest {
     /// Computes the digest of one record.
     pub(super) fn of(properties: &Properties) -> Self {
-        // FNV-1a: all hosts must compute the same value, and a forged digest gains nothing.
+        // All hosts compute the same value, and a forged digest gains nothing.
         let strings = properties.iter().flat_map(|(key, value)| {
             let ends = [0xff_u8, u8::try_from(value.len()).unwrap_or(u8::MAX)];
             key.bytes().chain(ends).chain(value.iter().copied())
         });
-        let digest = strings.fold(0xcbf2_9ce4_8422_2325, |hash: u64, byte| {
-            (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
-        });
+        let digest = fnv1a(strings);
         Self { agents: 1, digest }
     }
 

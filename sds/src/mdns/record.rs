@@ -36,7 +36,9 @@
 use std::collections::HashSet;
 use std::time::SystemTime;
 
-use fipa_transport::{Incarnation, Kind, Location, LocationError, PeerId, Principal, Signature};
+use fipa_transport::{
+    Incarnation, Kind, Location, LocationError, PeerId, Principal, Signature, fnv1a,
+};
 
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::{Entry, EntryError, Members, MtsId, Reach, Role, Source};
@@ -169,7 +171,7 @@ pub(super) fn label(name: &str, attempt: u32, gateway: Incarnation) -> String {
         0 => 0,
         _ => gateway.as_u64(),
     };
-    let hash = format!("~{:016x}", fnv1a(name, attempt, of));
+    let hash = format!("~{:016x}", name_hash(name, attempt, of));
     let beginning = plain.replace('\\', "_");
     let beginning = &beginning[..beginning.floor_char_boundary(MAX_LABEL - hash.len())];
     format!("{beginning}{hash}")
@@ -394,16 +396,13 @@ fn cut(text: &str) -> &str {
     &text[..text.floor_char_boundary(MAX_VALUE)]
 }
 
-/// FNV-1a: all hosts must compute the same value; it need not be unpredictable.
-fn fnv1a(name: &str, attempt: u32, gateway: u64) -> u64 {
+/// All hosts compute the same value; it need not be unpredictable.
+fn name_hash(name: &str, attempt: u32, gateway: u64) -> u64 {
     let numbers = attempt
         .to_be_bytes()
         .into_iter()
         .chain(gateway.to_be_bytes());
-    let bytes = name.bytes().chain(numbers);
-    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
-    })
+    fnv1a(name.bytes().chain(numbers))
 }
 
 #[cfg(test)]
