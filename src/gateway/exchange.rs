@@ -261,7 +261,7 @@ impl Exchanging {
         let present: Vec<Present> = neighbors.iter().map(located).collect();
         let mut core = self.core.lock();
         core.handle_neighbors(now, &present);
-        for (location, fault) in means.neighbors.take_doubted() {
+        for (location, fault) in means.neighbors.take_suspects() {
             if core.handle_silence(now, &location) {
                 if let Some(network) = &means.network {
                     network.ended(location.incarnation());

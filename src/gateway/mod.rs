@@ -556,7 +556,7 @@ trait Network: Send + Sync {
     /// Returns the last error, if there is one, and its changes.
     fn problem(&self) -> watch::Receiver<Option<String>>;
     /// Checks whether this gateway of another host still runs.
-    fn doubt(&self, gateway: Incarnation);
+    fn suspect(&self, gateway: Incarnation);
     /// Removes the entries of this gateway of another host, because another one has replaced it.
     fn ended(&self, gateway: Incarnation);
     /// Uses the changed interfaces of this host at once.
@@ -575,7 +575,7 @@ impl Network for fipa_sds::MdnsDirectory {
         self.last_error()
     }
 
-    fn doubt(&self, gateway: Incarnation) {
+    fn suspect(&self, gateway: Incarnation) {
         self.verify_gateway(gateway);
     }
 
@@ -721,9 +721,9 @@ impl Contacts for KnownPeers {
     }
 
     fn suspect(&self, location: &Location, fault: TransportErrorKind) {
-        self.neighbors.doubt(location, fault);
+        self.neighbors.suspect(location, fault);
         if let Some(network) = &*self.network.lock() {
-            network.doubt(location.incarnation());
+            network.suspect(location.incarnation());
         }
     }
 

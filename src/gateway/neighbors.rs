@@ -38,7 +38,7 @@ struct State {
     present: HashMap<Incarnation, Neighbor>,
     peers: Vec<Peer>,
     /// Locations at which an attempt failed, and the cause.
-    doubted: HashMap<Location, TransportErrorKind>,
+    suspected: HashMap<Location, TransportErrorKind>,
     /// The name of this gateway.
     own_name: Option<Arc<str>>,
     /// Whether a neighbor with the same name was reported.
@@ -54,8 +54,8 @@ const PARTED: Duration = Duration::from_secs(600);
 /// Maximum number of disconnected neighbors that are stored.
 const MAX_PARTED: usize = 64;
 
-/// Maximum number of doubted locations that wait to be handled.
-const MAX_DOUBTED: usize = 64;
+/// Maximum number of suspected locations that wait to be handled.
+const MAX_SUSPECTED: usize = 64;
 
 /// A gateway of another host with which a connection is open.
 #[derive(Debug, Clone)]
@@ -147,23 +147,23 @@ impl Neighbors {
         state.present.get(&gateway).map(|it| it.principal)
     }
 
-    /// Waits until a neighbor changes or a location is doubted. Only one task may wait.
+    /// Waits until a neighbor changes or a location is suspected. Only one task may wait.
     pub(super) async fn changed(&self) {
         self.changed.notified().await;
     }
 
     /// Records that an attempt at this location failed: the gateway may have ended.
-    pub(super) fn doubt(&self, location: &Location, fault: TransportErrorKind) {
+    pub(super) fn suspect(&self, location: &Location, fault: TransportErrorKind) {
         let mut state = self.state.lock();
-        if state.doubted.len() < MAX_DOUBTED {
-            state.doubted.insert(location.clone(), fault);
+        if state.suspected.len() < MAX_SUSPECTED {
+            state.suspected.insert(location.clone(), fault);
             self.changed.notify_one();
         }
     }
 
     /// Returns the locations at which attempts failed since the last call.
-    pub(super) fn take_doubted(&self) -> HashMap<Location, TransportErrorKind> {
-        std::mem::take(&mut self.state.lock().doubted)
+    pub(super) fn take_suspects(&self) -> HashMap<Location, TransportErrorKind> {
+        std::mem::take(&mut self.state.lock().suspected)
     }
 
     /// Adds a connection on which this peer has introduced itself.

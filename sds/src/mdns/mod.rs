@@ -193,12 +193,12 @@ impl MdnsDirectory {
     /// Queries the network for this gateway; see [`verify`](Self::verify). A repeated call within a
     /// few seconds does nothing.
     pub fn verify_gateway(&self, gateway: Incarnation) {
-        let doubted = self
+        let suspected = self
             .shared
             .peer_records
             .lock()
             .suspect(Instant::now(), gateway);
-        if doubted {
+        if suspected {
             self.shared.postponed.notify_one();
         }
     }

@@ -14,10 +14,10 @@ use crate::Entry;
 /// hundreds takes seconds instead of flooding the network.
 const BATCH: usize = 25;
 const PAUSE: Duration = Duration::from_millis(100);
-/// Time after the start of a doubt in which the removal of a queried record also casts doubt on the
+/// Time after the start of a suspicion in which the removal of a queried record also casts doubt on the
 /// rest of its gateway.
 const DOUBT: Duration = Duration::from_secs(6);
-/// Minimum time between two doubts of a gateway whose records change.
+/// Minimum time between two suspicions of a gateway whose records change.
 const AGAIN: Duration = Duration::from_secs(1);
 
 /// Records of other hosts by gateway, and the queue of those to verify.
@@ -37,9 +37,9 @@ pub(super) struct PeerRecords {
 struct Gateway {
     stored: StoredDigest,
     records: HashSet<Arc<str>>,
-    /// Start of the current doubt, and the record that stands for the gateway.
-    doubted: Option<(Instant, Arc<str>)>,
-    /// Records that are verified during this doubt.
+    /// Start of the current suspicion, and the record that stands for the gateway.
+    suspected: Option<(Instant, Arc<str>)>,
+    /// Records that are verified during this suspicion.
     verified: HashSet<Arc<str>>,
 }
 
@@ -53,8 +53,8 @@ impl PeerRecords {
             known.stored.changed = now;
             known.records.remove(fullname);
             let end = known
-                .doubted
-                .take_if(|(_, doubted)| entry.is_none() && doubted == fullname);
+                .suspected
+                .take_if(|(_, suspected)| entry.is_none() && suspected == fullname);
             if let Some((since, _)) = end
                 && now < since + DOUBT
             {
@@ -82,7 +82,7 @@ impl PeerRecords {
                 changed: now,
             },
             records: HashSet::new(),
-            doubted: None,
+            suspected: None,
             verified: HashSet::new(),
         });
         known.stored.digest.add(digest);
@@ -102,13 +102,13 @@ impl PeerRecords {
     }
 
     /// Doubts the gateway: queues up to `BATCH` of its records for verification first. If it has
-    /// more, one of these stands for the rest. Returns false when there are no records, or a doubt
+    /// more, one of these stands for the rest. Returns false when there are no records, or a suspicion
     /// has already started and no record changed since.
     pub(super) fn suspect(&mut self, now: Instant, gateway: Incarnation) -> bool {
         let Some(known) = self.gateways.get_mut(&gateway) else {
             return false;
         };
-        let already = known.doubted.as_ref();
+        let already = known.suspected.as_ref();
         if let Some((since, _)) = already {
             // Records that changed are a reason to ask again: the gateway may have moved again.
             let pause = match known.stored.changed > *since {
@@ -125,7 +125,7 @@ impl PeerRecords {
         };
         // A gateway with at most `BATCH` records has all of them verified, and each expires
         // individually.
-        known.doubted = Some((now, Arc::clone(first)));
+        known.suspected = Some((now, Arc::clone(first)));
         known.verified = asked.iter().cloned().collect();
         for fullname in asked.into_iter().rev() {
             self.queue.push_front(fullname);
@@ -135,7 +135,7 @@ impl PeerRecords {
     }
 
     /// Drops later copies of queued names when half of the queue may be copies: a gateway that stays silent
-    /// is doubted again and again, and the network decides how many gateways do so.
+    /// is suspected again and again, and the network decides how many gateways do so.
     fn shorten_queue(&mut self) {
         if self.queue.len() <= 2 * (self.records.len() + self.peers.len()) + BATCH {
             return;
@@ -264,7 +264,7 @@ mod tests {
         // The first batch is queried at once.
         let verified = holdings.due(now);
         assert_eq!(verified.len(), BATCH);
-        let [doubted, others @ ..] = &verified[..] else {
+        let [suspected, others @ ..] = &verified[..] else {
             panic!("no record was queried");
         };
         put(&mut holdings, now, others[0].parse().unwrap(), 7, false);
@@ -273,7 +273,7 @@ mod tests {
             None,
             "only one record was removed"
         );
-        put(&mut holdings, now, doubted.parse().unwrap(), 7, false);
+        put(&mut holdings, now, suspected.parse().unwrap(), 7, false);
         let mut asked = Vec::new();
         let mut now = now;
         while let Some(due) = holdings.poll_timeout(now) {
@@ -287,11 +287,11 @@ mod tests {
             60 - BATCH,
             "the records that were not queried yet"
         );
-        // After the doubt, the end of a record affects no others.
+        // After the suspicion, the end of a record affects no others.
         assert!(holdings.suspect(now, gateway));
-        let doubted = holdings.due(now + PAUSE);
+        let suspected = holdings.due(now + PAUSE);
         now += DOUBT;
-        put(&mut holdings, now, doubted[0].parse().unwrap(), 7, false);
+        put(&mut holdings, now, suspected[0].parse().unwrap(), 7, false);
         assert_eq!(holdings.poll_timeout(now), None);
     }
 
@@ -324,7 +324,7 @@ mod tests {
             }
         }
         assert!(holdings.queue.len() <= 2 * 250 + BATCH);
-        // Each record is still verified, those of the last doubt first.
+        // Each record is still verified, those of the last suspicion first.
         let mut now = start;
         let last: HashSet<Arc<str>> = holdings.due(now).into_iter().collect();
         assert!(last.iter().all(|it| it.parse::<u64>().unwrap() % 10 == 9));

@@ -55,7 +55,7 @@ const MISSING: &[Duration] = &[
 /// Time for which a record may stay introduced without being known: the sum of `MISSING`, and time
 /// for the last answer.
 const INTRODUCED: Duration = Duration::from_secs(15);
-/// Delays of the queries for a record in doubt, and the time it has to be confirmed.
+/// Delays of the queries for a record suspected, and the time it has to be confirmed.
 const DOUBTED: &[Duration] = &[Duration::ZERO, Duration::from_millis(1100)];
 const TIMEOUT: Duration = Duration::from_secs(2);
 /// Time for which a record stays known after its goodbye, so that the goodbye can be revoked (RFC
@@ -156,7 +156,7 @@ struct Record {
     interfaces: Vec<u32>,
     /// Whether both its SRV and TXT record have arrived.
     known: bool,
-    /// Expiry if nothing more arrives: the record is not known yet, is in doubt, or had a goodbye.
+    /// Expiry if nothing more arrives: the record is not known yet, is suspected, or had a goodbye.
     ends: Option<Instant>,
     questions: Option<Questions>,
 }

@@ -224,8 +224,8 @@ fn a_goodbye_takes_effect_after_a_second_unless_it_is_revoked() {
 fn a_doubted_record_is_confirmed_or_removed() {
     let start = Instant::now();
     let mut browser = browser(start, &["arm", "leg"]);
-    let doubted = ["arm", "leg"].map(|label| format!("{label}.{SERVICE_TYPE}").into());
-    browser.suspect(start, &doubted);
+    let suspected = ["arm", "leg"].map(|label| format!("{label}.{SERVICE_TYPE}").into());
+    browser.suspect(start, &suspected);
     let (questions, _) = run_timers(&mut browser, start, 0.5);
     assert_eq!(questions.len(), 4, "{questions:?}");
     let now = start + seconds(0.5);
@@ -236,8 +236,8 @@ fn a_doubted_record_is_confirmed_or_removed() {
     assert!(again.all(|(_, what)| what.starts_with("arm")));
     assert_eq!(gone, [20]);
     // A beacon is not an answer.
-    browser.belongs(&doubted[1], OTHER);
-    browser.suspect(now, &doubted);
+    browser.belongs(&suspected[1], OTHER);
+    browser.suspect(now, &suspected);
     browser.confirm(now + seconds(0.1), OTHER);
     let (_, gone) = run_timers(&mut browser, start, 5.0);
     assert_eq!(gone, [25]);
