@@ -499,11 +499,7 @@ fn reads_back_the_same(config: &Config) {
 
 #[test]
 fn names_with_signs_and_addresses_with_zones_read_back_the_same() {
-    for (name, listen) in [
-        ("®", "[fe80::1%eth0]:1"),
-        ("{", "127.0.0.1:0"),
-        ("\u{10a05}", "127.0.0.1:0"),
-    ] {
+    for (name, listen) in [("®", "[fe80::1%eth0]:1"), ("\u{10a05}", "127.0.0.1:0")] {
         let mut config = Config::default();
         config.mts.name = name.to_owned();
         config.transport.tcp.listen = vec![listen.to_owned()];
