@@ -17,7 +17,7 @@ struct Counter;
 
 impl Subscriber for Counter {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
-        metadata.target() == "fipa::checks" && metadata.name() != "span"
+        metadata.target() == "fipa::agent::checks" && metadata.name() != "span"
     }
 
     fn new_span(&self, _: &Attributes<'_>) -> Id {
