@@ -155,6 +155,6 @@ pub use fipa_transport::{
     LocationError, Outcome, Signature, TransportError, TransportErrorKind,
 };
 #[doc(hidden)]
-pub use fipa_transport::{log_limit, threads};
+pub use fipa_transport::{fnv1a, log_limit, threads};
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbor};

@@ -12,6 +12,7 @@ use fipa::locks::{Fence, Lock, OwnOptions, Owned, with_fences};
 use fipa::monitor::Library;
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, ErrorChain, Gateway, Incoming, Performative, Reach,
+    fnv1a,
 };
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -362,7 +363,7 @@ fn outcomes(deliveries: &Deliveries) -> Result<Event, String> {
 }
 
 async fn send_large(agent: &Agent, to: &str, len: usize) -> Result<Event, String> {
-    let expected = checksum_of(pattern(len));
+    let expected = fnv1a(pattern(len));
     let message = agent
         .message(Performative::Inform)
         .receiver(id(to)?)
@@ -386,12 +387,6 @@ async fn send_large(agent: &Agent, to: &str, len: usize) -> Result<Event, String
 /// A byte pattern whose period matches no buffer size.
 fn pattern(len: usize) -> impl Iterator<Item = u8> {
     (0..len).map(|index| (index.wrapping_mul(0x9e37_79b1) >> 13) as u8)
-}
-
-/// The 64-bit FNV-1a hash.
-fn checksum_of(bytes: impl Iterator<Item = u8>) -> u64 {
-    let step = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
-    bytes.fold(0xcbf2_9ce4_8422_2325, step)
 }
 
 fn agents(agent: &Agent) -> Vec<Listed> {
@@ -460,8 +455,7 @@ fn received_message(incoming: &Incoming) -> Received {
         content: (content.len() <= 1024).then(text).flatten(),
         len: content.len(),
         in_shared_memory: is_in_shared_memory(&content),
-        intact: sent
-            .map(|(_, sent)| *sent == format!("{:016x}", checksum_of(content.iter().copied()))),
+        intact: sent.map(|(_, sent)| *sent == format!("{:016x}", fnv1a(content.iter().copied()))),
     }
 }
 
