@@ -1,4 +1,4 @@
-//! What a process reports about the routes of its letters.
+//! The report of a process about the routes of its letters.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;

@@ -1,4 +1,4 @@
-//! What the connections of all network transports do with answers. [`fipa_transport::wire`] defines their bytes.
+//! Limits on answers that all network transports share. [`fipa_transport::wire`] defines the bytes of an answer.
 
 use fipa_transport::Answer;
 

@@ -248,11 +248,11 @@ impl Inbox {
             },
             ticket,
         };
-        let verdict = sink.arrived(arrival);
+        let reaction = sink.arrived(arrival);
         if let Some(deferred) = &self.deferred
             && let Some(ticket) = ticket
         {
-            match verdict {
+            match reaction {
                 Reaction::Now(_) => unanswered = deferred.take(ticket),
                 Reaction::Later => {
                     count(&self.tally.deferred);
@@ -260,7 +260,7 @@ impl Inbox {
                 }
             }
         }
-        let answer = match verdict {
+        let answer = match reaction {
             Reaction::Now(answer) => answer,
             Reaction::Later => Answer::failed(
                 FailureReason::Refused,

@@ -185,7 +185,7 @@ impl Ack {
     }
 }
 
-/// What an answer without data adds to the word for it: one more than its only byte, since 0 is no answer.
+/// The code in a word for an answer without data: one more than its only byte, since 0 is no answer.
 pub(crate) fn code_of(answer: &Answer) -> Option<u8> {
     let mut code = [0];
     if wire::answer_len(answer) > code.len() {

@@ -1,4 +1,4 @@
-//! Who a peer has proved to be.
+//! The identity that a peer has proved.
 
 /// The identity that a link proves for the service at its other end. Services are told apart only
 /// by this, and not by their own claims.

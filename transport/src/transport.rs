@@ -23,7 +23,7 @@ use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 ///    most one connection, and is not sent after the attempt was concluded as not sent.
 /// 3. **Answers come from the receiving sink.** `Accepted` is reported only after the receiving
 ///    sink has returned it; the transport acknowledges nothing on its behalf. The sink gets the
-///    parcel of an attempt once. If a copy reaches it all the same, its verdict does not answer the
+///    parcel of an attempt once. If a copy reaches it all the same, its reaction does not answer the
 ///    attempt.
 /// 4. **Order.** Letters of one stream that are posted to one location arrive in the order of the calls, or do
 ///    not arrive.
@@ -143,7 +143,7 @@ pub struct LegacySource {
 
 /// The receiver of arrivals and conclusions: the delivery core.
 pub trait Sink: Send + Sync {
-    /// Handles a parcel that arrived. The verdict determines the answer to the sender.
+    /// Handles a parcel that arrived. The reaction determines the answer to the sender.
     fn arrived(&self, arrival: Arrival) -> Reaction;
 
     /// Handles a letter of a legacy peer, which has no parcel header and gets no answer. The

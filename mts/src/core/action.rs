@@ -1,4 +1,4 @@
-//! What the core asks its runtime to do.
+//! The actions that the core asks its runtime to perform.
 
 use std::sync::Arc;
 

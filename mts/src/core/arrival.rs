@@ -98,9 +98,9 @@ impl Core {
         let registration = label.stream.receiver;
         let Some(inbox) = self.agents.get_mut(&registration) else {
             let unanswered = ticket.map(|ticket| (via, ticket));
-            let verdict = self.forward(now, (via, from, unanswered), label, letter, read);
+            let reaction = self.forward(now, (via, from, unanswered), label, letter, read);
             self.send_failures(now);
-            return verdict;
+            return reaction;
         };
         let seen = self.table.watched.then(|| letter.clone());
         let parts = read.as_ref().and_then(|read| read.parts.as_ref());

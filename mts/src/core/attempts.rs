@@ -1,4 +1,4 @@
-//! What all lanes use: the actions for the runtime, attempts in progress, and the state below them.
+//! The state that all lanes share: the actions for the runtime, the attempts in progress, and the parts below them.
 
 use std::collections::VecDeque;
 use std::sync::Arc;

@@ -118,7 +118,7 @@ impl Core {
 
     /// Reports an agent of a legacy peer as a contact, at the location that it states as its own. Only for an
     /// agent that is unknown, or known as a contact. Returns whether it did.
-    pub(super) fn report_legacy_contact(
+    fn report_legacy_contact(
         &mut self,
         now: Now,
         (name, stated): (String, Stated),

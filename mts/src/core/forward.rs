@@ -27,6 +27,7 @@ const CUSTODY_AFTER: Duration = Duration::from_millis(200);
 const FOUND_AFTER: Duration = Duration::from_millis(1500);
 /// Time that remains for the delivery of a letter that waits until its sender is found.
 const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
+
 impl Core {
     /// Takes a letter for an agent of another process into custody, or returns the reason why not.
     /// `unanswered` is the arrival that may be answered later, `read` has the parts of the

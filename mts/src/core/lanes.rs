@@ -102,7 +102,7 @@ impl Core {
         }
     }
 
-    pub(super) fn visit_lane(&mut self, now: Now, id: LaneId, concern: Concern) {
+    fn visit_lane(&mut self, now: Now, id: LaneId, concern: Concern) {
         match concern {
             Concern::Directory => self.with_lane(now, id, |lane, table| {
                 if !lane.is_empty() {
@@ -119,7 +119,7 @@ impl Core {
         }
     }
 
-    pub(super) fn forget_idle_lane(&mut self, now: Now, id: LaneId, memory: Duration) {
+    fn forget_idle_lane(&mut self, now: Now, id: LaneId, memory: Duration) {
         let Some(lane) = self.lanes.get(&id) else {
             return;
         };
@@ -141,7 +141,7 @@ impl Core {
 
     /// Drops empty lanes when their number has doubled since the last time, because peers can invent
     /// senders, each with a lane.
-    pub(super) fn disperse_crowd(&mut self, now: Now) {
+    fn disperse_crowd(&mut self, now: Now) {
         let is_under_way = self.passes.has(Concern::Crowd);
         if self.lanes.len() < self.crowd && !is_under_way {
             return;

@@ -5,14 +5,14 @@
 //! [`Action`]s. The same core serves a robot process and, with permission to forward, the gateway;
 //! simulations run it on virtual time.
 //!
-//! What goes in:
+//! Inputs:
 //!
 //! * `submit`: letters of agents of this process; their receivers are looked up.
 //! * `arrival`: parcels from other services; unknown receivers are refused.
 //! * `unframed`: letters of legacy peers.
 //! * `network`: changes of the directory, of connections, of trust.
 //!
-//! What happens to a letter:
+//! The path of a letter:
 //!
 //! * `waiting`: it waits for a refresh of the directory.
 //! * `lane`: it is among the open letters of one stream, in order, on one route at a time; `lanes` creates,
@@ -22,15 +22,15 @@
 //! * `inbox`: it is accepted once and in order into an agent's queue.
 //! * `settlement`: its sender, or the services that handed it over, are told its end.
 //!
-//! Beside them:
+//! Parts that these use:
 //!
 //! * `rules`: the rules that keep a stream in order and alive, as pure functions.
-//! * `attempts`: what all lanes use; attempts in progress. `ids`: names within a core.
+//! * `attempts`: the state that all lanes share; attempts in progress. `ids`: names within a core.
 //! * `label`, `origin`, `tally`, `undelivered`: values that the others pass on.
-//! * `action`: what the runtime is asked to do.
+//! * `action`: the actions for the runtime.
 //! * `notes`: reports, credits and predecessors, which are repeated or wait for room.
 //! * `failures`: failure messages to senders; `limits`: their rate limits.
-//! * `principals`: who a service and a sender have proved to be.
+//! * `principals`: the identities that services and senders have proved.
 //! * `contacts`: agents that become known by their letters.
 //! * `peers`: services in the configuration, and the state of contact with them.
 //! * `departed`: registrations that recently left this host.

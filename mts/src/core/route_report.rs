@@ -139,7 +139,7 @@ impl AttemptTable {
     }
 
     /// The counters of each location, sorted by location.
-    pub(super) fn way_states(&self, now: Instant) -> Vec<RouteState> {
+    fn way_states(&self, now: Instant) -> Vec<RouteState> {
         let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         let tallies = self.tallies.0.iter();
         let mut states: Vec<RouteState> = tallies

@@ -1,4 +1,4 @@
-//! The end of a letter in a lane, and who is told.
+//! The end of a letter in a lane, and the report of it to its sender or to the services that handed it over.
 
 use std::sync::Arc;
 use std::time::Instant;

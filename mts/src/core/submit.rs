@@ -120,7 +120,7 @@ impl Core {
     }
 
     /// Whether no earlier letter of this sender waits to be resolved.
-    pub(super) fn is_in_turn(&self, sender: Incarnation) -> bool {
+    fn is_in_turn(&self, sender: Incarnation) -> bool {
         self.waiting.is_empty() || !self.waiting.has_any_of(sender)
     }
 
@@ -208,7 +208,7 @@ impl Core {
         self.fail_receivers(letter, reason);
     }
 
-    pub(super) fn fail_receivers(&mut self, letter: Unresolved, reason: FailureReason) {
+    fn fail_receivers(&mut self, letter: Unresolved, reason: FailureReason) {
         let Unresolved {
             send,
             sender,
@@ -252,7 +252,7 @@ impl Core {
         send
     }
 
-    pub(super) fn submit_one(
+    fn submit_one(
         &mut self,
         now: Now,
         (send, sender): (SubmissionId, Incarnation),
@@ -349,7 +349,7 @@ impl Core {
         });
     }
 
-    pub(super) fn undeliverable(
+    fn undeliverable(
         &mut self,
         send: SubmissionId,
         sender: Incarnation,

@@ -330,7 +330,7 @@ impl Core {
     }
 
     /// Handles a legacy peer's letter for an agent of this host.
-    pub(super) fn unframed_arrived(
+    fn unframed_arrived(
         &mut self,
         now: Now,
         deadline: Duration,
@@ -407,7 +407,7 @@ impl Core {
     }
 
     /// Reports that a legacy peer's letter cannot be delivered to this receiver.
-    pub(super) fn unframed_failed(
+    fn unframed_failed(
         &mut self,
         receiver: &Arc<str>,
         unframed: &Unframed,
@@ -431,7 +431,7 @@ impl Core {
     }
 
     /// Has the source of a legacy peer's letter told that this receiver does not get it.
-    pub(super) fn unframed_undelivered(
+    fn unframed_undelivered(
         &mut self,
         receiver: &Arc<str>,
         unframed: &Unframed,

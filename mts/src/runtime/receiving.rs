@@ -39,11 +39,11 @@ impl Sink for TransportSink {
             state = shared.lock();
         }
         let now = state.clocks.now();
-        let verdict = state
+        let reaction = state
             .core
             .handle_read_arrival(now, self.kind, arrival, read);
         shared.carry_out(state);
-        verdict
+        reaction
     }
 
     fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource) {

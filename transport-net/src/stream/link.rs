@@ -907,12 +907,12 @@ impl LinkTask {
                 }
                 let from = peer.hop.clone();
                 let ticket = self.link.ticket(id);
-                let verdict = self.sink.arrived(fipa_transport::Arrival {
+                let reaction = self.sink.arrived(fipa_transport::Arrival {
                     parcel: *parcel,
                     from,
                     ticket: Some(ticket),
                 });
-                if let fipa_transport::Reaction::Now(answer) = verdict {
+                if let fipa_transport::Reaction::Now(answer) = reaction {
                     let mut state = self.link.state.lock();
                     state.connection.answer(id, &answer, Instant::now());
                 }

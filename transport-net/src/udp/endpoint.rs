@@ -85,12 +85,12 @@ impl Protocol for Core {
                 from,
                 ticket,
             } => {
-                let verdict = sink.arrived(Arrival {
+                let reaction = sink.arrived(Arrival {
                     parcel: *parcel,
                     from,
                     ticket: Some(ticket),
                 });
-                if let Reaction::Now(answer) = verdict {
+                if let Reaction::Now(answer) = reaction {
                     with(&mut |core| core.answer(Instant::now(), ticket, &answer));
                 }
             }

@@ -154,7 +154,7 @@ pub(crate) struct Record {
 
 pub(crate) struct Recorder {
     pub(crate) record: Mutex<Record>,
-    verdict: Reaction,
+    reaction: Reaction,
     /// Bytes of lent memory now and at most, if memory is lent.
     lent: Option<Arc<Mutex<(usize, usize)>>>,
     /// Further locations of every service.
@@ -167,7 +167,7 @@ impl Default for Recorder {
     fn default() -> Self {
         Self {
             record: Mutex::default(),
-            verdict: Reaction::Now(Answer::Accepted),
+            reaction: Reaction::Now(Answer::Accepted),
             lent: None,
             also_at: Mutex::default(),
             refuses_peers: AtomicBool::new(false),
@@ -208,7 +208,7 @@ impl Sink for Recorder {
         } = arrival;
         let ticket = ticket.expect("the answer may come later");
         self.record.lock().arrivals.push((parcel, from, ticket));
-        self.verdict.clone()
+        self.reaction.clone()
     }
 
     fn memory_for(&self, arriving: &Arriving<'_>) -> Option<Box<dyn LoanedContent>> {
@@ -272,9 +272,9 @@ impl Party {
         Self::judging(config, Reaction::Now(Answer::Accepted))
     }
 
-    pub(crate) fn judging(config: TcpConfig, verdict: Reaction) -> Self {
+    pub(crate) fn judging(config: TcpConfig, reaction: Reaction) -> Self {
         let sink = Recorder {
-            verdict,
+            reaction,
             ..Recorder::default()
         };
         Self::over(sink, |runtime| TcpTransport::new(config, runtime))

@@ -30,19 +30,19 @@ pub(super) struct Record {
 
 pub(super) struct RecordingSink {
     pub(super) record: Mutex<Record>,
-    verdict_of: VerdictOf,
+    reaction_of: VerdictOf,
 }
 
 impl Sink for RecordingSink {
     fn arrived(&self, arrival: Arrival) -> Reaction {
-        let verdict = (self.verdict_of)(&arrival);
+        let reaction = (self.reaction_of)(&arrival);
         let Arrival {
             parcel,
             from,
             ticket,
         } = arrival;
         self.record.lock().arrivals.push((parcel, from, ticket));
-        verdict
+        reaction
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {
@@ -81,12 +81,12 @@ impl TestEndpoint {
 
     pub(super) fn with_verdict(
         fixture: &dyn Fixture,
-        verdict_of: impl Fn(&Arrival) -> Reaction + Send + Sync + 'static,
+        reaction_of: impl Fn(&Arrival) -> Reaction + Send + Sync + 'static,
     ) -> Self {
         let transport = fixture.endpoint();
         let sink = Arc::new(RecordingSink {
             record: Mutex::default(),
-            verdict_of: Box::new(verdict_of),
+            reaction_of: Box::new(reaction_of),
         });
         let locations = transport
             .listen(Arc::clone(&sink) as Arc<dyn Sink>)
