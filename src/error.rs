@@ -26,12 +26,14 @@ pub enum OpenError {
     /// The configuration is invalid.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// The background thread of [`crate::blocking`] cannot be started.
+    /// The system refuses a thread for work that blocks.
     #[error("cannot start the background thread")]
     Thread(#[source] std::io::Error),
-    /// The call was made outside a tokio runtime. Processes without a runtime use
-    /// [`crate::blocking`].
-    #[error("no tokio runtime is running; call this within one, or use fipa::blocking")]
+    /// The call was made outside a tokio runtime. Processes without a runtime wait for
+    /// it with [`Wait`](crate::blocking::Wait).
+    #[error(
+        "no tokio runtime is running; call this within one, or wait for it with fipa::blocking::Wait"
+    )]
     NoRuntime,
     /// The directory of the domain cannot be used.
     #[error(transparent)]

@@ -78,7 +78,7 @@
 //!
 //! # Without an async runtime
 //!
-//! [`blocking`] has the same calls for threads.
+//! Threads wait for the calls with [`Wait::wait`](blocking::Wait::wait).
 //!
 //! # Examples and tools
 //!

@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use fipa::blocking::{Agent, Domain};
-use fipa::{AgentId, Config, Performative};
+use fipa::blocking::Wait;
+use fipa::{Agent, AgentId, Config, Domain, Performative};
 use fipa_testbed::ignored_test;
 
 const WATCHDOG: Duration = Duration::from_secs(60);
@@ -45,8 +45,8 @@ fn is_delivered(from: &Agent, to: &Agent, len: usize) -> bool {
     let message = from.message(Performative::Inform);
     let message = message.receiver(AgentId::new(to.name()).unwrap());
     let message = message.content(vec![1; len]).build().unwrap();
-    let delivered = from.send(message).unwrap().all_succeeded();
-    while let Ok(Some(_)) = to.receive_within(Duration::ZERO) {}
+    let delivered = from.send(message).wait().unwrap().all_succeeded();
+    while let Ok(Some(_)) = to.receive_within(Duration::ZERO).wait() {}
     delivered
 }
 
@@ -78,10 +78,10 @@ fn inside_a_directory_that_is_removed() {
     let run = runtime_dir();
     for transports in ["shm", "unix", "shm,unix"] {
         let config = config(transports);
-        let domains = [(); 2].map(|()| Domain::open(&config).unwrap());
+        let domains = [(); 2].map(|()| Domain::open(&config).wait().unwrap());
         let (arm, leg) = (
-            domains[0].register("arm").unwrap(),
-            domains[1].register("leg").unwrap(),
+            domains[0].register("arm").wait().unwrap(),
+            domains[1].register("leg").wait().unwrap(),
         );
         until_letters_arrive(&arm, &leg);
         for moved in [false, true] {
@@ -94,17 +94,17 @@ fn inside_a_directory_that_is_removed() {
             }
             // A name may be unknown until all processes have joined again.
             until_letters_arrive(&arm, &leg);
-            let newcomer = Domain::open(&config).unwrap();
-            let foot = newcomer.register("foot").unwrap();
+            let newcomer = Domain::open(&config).wait().unwrap();
+            let foot = newcomer.register("foot").wait().unwrap();
             until_letters_arrive(&foot, &arm);
             until_letters_arrive(&foot, &leg);
             drop(foot);
-            newcomer.close();
+            newcomer.close().wait();
             let _ = std::fs::remove_dir_all(away);
         }
         drop((arm, leg));
         for domain in domains {
-            domain.close();
+            domain.close().wait();
         }
     }
 }
@@ -130,10 +130,10 @@ fn inside_a_cleaned_directory() {
     let run = runtime_dir();
     let cleaned = run.parent().unwrap();
     let config = config("shm,unix");
-    let domain = Domain::open(&config).unwrap();
+    let domain = Domain::open(&config).wait().unwrap();
     let (arm, leg) = (
-        domain.register("arm").unwrap(),
-        domain.register("leg").unwrap(),
+        domain.register("arm").wait().unwrap(),
+        domain.register("leg").wait().unwrap(),
     );
     let files = || -> Vec<PathBuf> {
         let mut found = vec![run.clone()];
@@ -167,5 +167,5 @@ fn inside_a_cleaned_directory() {
     }
     until_letters_arrive(&arm, &leg);
     drop((arm, leg));
-    domain.close();
+    domain.close().wait();
 }

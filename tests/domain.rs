@@ -8,6 +8,7 @@ mod support;
 use std::collections::HashSet;
 use std::time::Duration;
 
+use fipa::blocking::Wait;
 use fipa::{
     AgentId, Deliveries, Domain, FailureReason, Kind, Outcome, Performative, RegisterError,
 };
@@ -457,38 +458,6 @@ async fn a_deregistered_agent_is_unknown_and_its_successor_is_reached() {
     );
 }
 
-#[test]
-fn processes_without_a_runtime_have_the_same_calls() {
-    let config = config(&[]);
-    let here = fipa::blocking::Domain::open(&config).unwrap();
-    let there = fipa::blocking::Domain::open(&config).unwrap();
-    let (rover, arm) = (
-        here.register("rover").unwrap(),
-        there.register("arm").unwrap(),
-    );
-    assert!(
-        rover
-            .receive_within(Duration::from_millis(1))
-            .unwrap()
-            .is_none()
-    );
-    let message = rover
-        .message(Performative::Inform)
-        .receiver(arm.id().clone())
-        .content("hello");
-    // The letter is delivered although no call receives yet.
-    assert!(
-        rover
-            .send(message.build().unwrap())
-            .unwrap()
-            .all_succeeded()
-    );
-    assert_eq!(arm.receive().unwrap().message().content().unwrap(), "hello");
-    drop((rover, arm));
-    here.close();
-    there.close();
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn closing_a_domain_removes_its_files_and_shared_memory() {
     let config = config(&[]);
@@ -550,12 +519,15 @@ fn processes_may_join_and_leave_concurrently() {
             let config = &config;
             scope.spawn(move || {
                 for round in 0..10 {
-                    let domain = fipa::blocking::Domain::open(config).unwrap();
-                    let agent = domain.register(&format!("agent-{member}-{round}")).unwrap();
+                    let domain = Domain::open(config).wait().unwrap();
+                    let agent = domain
+                        .register(&format!("agent-{member}-{round}"))
+                        .wait()
+                        .unwrap();
                     let entry = domain.directory().lookup(agent.name()).unwrap();
                     assert_eq!(entry.locations.len(), 2, "a transport could not be used");
                     drop(agent);
-                    domain.close();
+                    domain.close().wait();
                 }
             });
         }

@@ -11,10 +11,10 @@ mod support;
 use std::process::Command;
 use std::time::Duration;
 
-use fipa::blocking::{Agent, Domain};
+use fipa::blocking::Wait;
 use fipa::{
-    AgentId, Config, Forked, Incoming, Message, Performative, ReceiveError, RegisterError,
-    SendError,
+    Agent, AgentId, Config, Domain, Forked, Incoming, Message, Performative, ReceiveError,
+    RegisterError, SendError,
 };
 use fork::{Fork, fork, waitpid};
 
@@ -70,7 +70,7 @@ fn letter(from: &Agent, to: &str) -> Message {
 }
 
 fn is_delivered(from: &Agent, to: &str) -> bool {
-    let sent = from.send(letter(from, to)).unwrap();
+    let sent = from.send(letter(from, to)).wait().unwrap();
     sent.all_succeeded()
 }
 
@@ -106,26 +106,26 @@ fn a_child_neither_uses_nor_releases_its_parents_membership() {
 fn parent_of_a_child_that_drops() {
     let config = config(&domain_name());
     let (here, there) = (
-        Domain::open(&config).unwrap(),
-        Domain::open(&config).unwrap(),
+        Domain::open(&config).wait().unwrap(),
+        Domain::open(&config).wait().unwrap(),
     );
     let (arm, leg) = (
-        here.register("arm").unwrap(),
-        there.register("leg").unwrap(),
+        here.register("arm").wait().unwrap(),
+        there.register("leg").wait().unwrap(),
     );
     let team = ["arm", "leg"];
     assert!(is_delivered(&leg, "arm"));
     assert!(is_delivered(&arm, "leg"));
-    let held = arm.receive().unwrap();
+    let held = arm.receive().wait().unwrap();
     let loan = arm.loan(letter(&arm, "leg"), CONTENT.len()).unwrap();
 
     match fork().unwrap() {
         Fork::Child => {
-            let send = arm.send(letter(&arm, "leg"));
+            let send = arm.send(letter(&arm, "leg")).wait();
             let loaned = arm.loan(letter(&arm, "leg"), CONTENT.len());
-            let received = arm.receive();
-            let waited = arm.receive_within(Duration::from_millis(1));
-            let registered = here.register("foot");
+            let received = arm.receive().wait();
+            let waited = arm.receive_within(Duration::from_millis(1)).wait();
+            let registered = here.register("foot").wait();
             let parent = std::os::unix::process::parent_id();
             let refused = Forked { owner: parent };
             let checks = [
@@ -143,7 +143,7 @@ fn parent_of_a_child_that_drops() {
                 ("content", is_whole(&held)),
             ];
             drop((held, loan, arm, leg));
-            here.close();
+            here.close().wait();
             drop(there);
             exit(&checks);
         }
@@ -160,20 +160,20 @@ fn parent_of_a_child_that_drops() {
         assert!(is_delivered(&leg, "arm"));
         assert!(is_delivered(&arm, "leg"));
         for agent in [&arm, &leg] {
-            let received = agent.receive().unwrap();
+            let received = agent.receive().wait().unwrap();
             assert!(is_whole(&received));
         }
     }
     let mut loan = loan;
     loan.content_mut().fill(9);
-    assert!(arm.send_loan(loan).unwrap().all_succeeded());
-    let newcomer = Domain::open(&config).unwrap();
-    let visitor = newcomer.register("visitor").unwrap();
+    assert!(arm.send_loan(loan).wait().unwrap().all_succeeded());
+    let newcomer = Domain::open(&config).wait().unwrap();
+    let visitor = newcomer.register("visitor").wait().unwrap();
     assert!(is_delivered(&visitor, "arm"));
     assert!(is_whole(&held));
     drop((held, visitor, arm, leg));
     for domain in [newcomer, here, there] {
-        domain.close();
+        domain.close().wait();
     }
     let files = std::fs::read_dir("/dev/shm").unwrap().flatten();
     let prefix = format!("fipa_{}_", domain_name());
@@ -190,21 +190,21 @@ fn a_child_can_join_the_domain_with_a_membership_of_its_own() {
 #[ignore = "is run by the other test in a process of its own"]
 fn parent_of_a_child_that_joins() {
     let config = config(&domain_name());
-    let here = Domain::open(&config).unwrap();
-    let arm = here.register("arm").unwrap();
+    let here = Domain::open(&config).wait().unwrap();
+    let arm = here.register("arm").wait().unwrap();
     match fork().unwrap() {
         Fork::Child => {
-            let own = Domain::open(&config).unwrap();
-            let foot = own.register("foot").unwrap();
+            let own = Domain::open(&config).wait().unwrap();
+            let foot = own.register("foot").wait().unwrap();
             let checks = [("delivered", is_delivered(&foot, "arm"))];
             drop(foot);
-            own.close();
+            own.close().wait();
             drop((arm, here));
             exit(&checks);
         }
         Fork::Parent(child) => wait_for(child),
     }
-    assert!(is_whole(&arm.receive().unwrap()));
+    assert!(is_whole(&arm.receive().wait().unwrap()));
     drop(arm);
-    here.close();
+    here.close().wait();
 }

@@ -1,5 +1,5 @@
 //! The interface of domains and agents: messages by builder, handles of an agent, the list of agents and
-//! its changes, loans, and the blocking calls.
+//! its changes, loans, and waits of threads.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -7,14 +7,14 @@ mod support;
 
 use std::collections::BTreeSet;
 use std::future::poll_fn;
-use std::path::Path;
 use std::pin::Pin;
 use std::time::Duration;
 
 use fipa::Performative::{Inform, Request};
+use fipa::blocking::Wait;
 use fipa::{
     AgentIdError, BuildError, Change, Config, DeregisterError, Domain, FailureReason, Outcome,
-    ReceiveError, RegisterOptions, SendError, blocking,
+    ReceiveError, RegisterOptions, SendError,
 };
 use fipa_testbed::until_async;
 use futures_core::Stream;
@@ -299,56 +299,56 @@ async fn memory_that_loans_hold_is_a_reason_of_its_own() {
     assert_eq!(arm.receive().await.unwrap().message().text(), "first");
 }
 
-/// Uses all kinds of blocking calls.
+/// Uses calls that wait.
 fn converse(config: &Config) {
-    let domain = blocking::Domain::open(config).unwrap();
+    let domain = Domain::open(config).wait().unwrap();
     let mut changes = domain.changes();
-    let rover = domain.register("rover").unwrap();
-    let arm = domain.register_with("arm", of_type("arm")).unwrap();
-    assert_ne!(rover.unique_id(), rover.unique_id());
-    assert_eq!(rover.domain().agents_of_type("arm").len(), 1);
-    assert_eq!(domain.agents().len(), 2);
-    let joined = std::iter::from_fn(|| changes.next_within(TIMEOUT)).find_map(|it| match it {
+    let rover = domain.register("rover").wait().unwrap();
+    let arm = domain.register_with("arm", of_type("arm")).wait().unwrap();
+    let joined = std::iter::from_fn(|| changes.next().wait()).find_map(|it| match it {
         Change::Joined(entry) if &*entry.name == "arm" => Some(entry.incarnation),
         _ => None,
     });
     assert_eq!(joined, Some(arm.incarnation()));
-    let routes = domain.routes(&fipa::Query::all());
-    assert_eq!(routes.routes.len(), 2);
-    let group = domain
-        .form("group", ["arm"], None, RegisterOptions::default())
-        .unwrap();
-    assert!(arm.try_receive().unwrap().is_none());
+    // The letter is delivered although no call receives yet.
+    let early = rover.message(Inform).receiver("arm").content("early");
+    assert!(rover.send(early).wait().unwrap().all_succeeded());
+    assert!(arm.try_receive().unwrap().is_some());
+    assert!(
+        arm.receive()
+            .wait_within(Duration::from_millis(1))
+            .is_none()
+    );
     let echo = std::thread::spawn({
         let arm = arm.clone();
         move || {
-            let letter = arm.receive().unwrap();
+            let letter = arm.receive().wait().unwrap();
             let answer = arm.reply(letter.message(), Inform).content("done");
-            arm.send(answer).unwrap()
+            arm.send(answer).wait().unwrap()
         }
     });
     // More letters than the budget of a task of tokio.
     for _ in 0..300 {
         let sent = rover.send(rover.message(Inform).receiver("rover"));
-        assert!(sent.unwrap().all_succeeded());
-        assert!(rover.receive_within(TIMEOUT).unwrap().is_some());
+        assert!(sent.wait().unwrap().all_succeeded());
+        assert!(rover.receive_within(TIMEOUT).wait().unwrap().is_some());
     }
-    let lift = rover.message(Request).receiver(group.name()).content("x");
-    assert!(rover.send(lift).unwrap().all_succeeded());
-    let answer = rover.receive_within(TIMEOUT).unwrap().unwrap();
+    let lift = rover.message(Request).receiver("arm").content("x");
+    assert!(rover.send(lift).wait().unwrap().all_succeeded());
+    let answer = rover.receive_within(TIMEOUT).wait().unwrap().unwrap();
     assert_eq!(answer.message().text(), "done");
     assert!(echo.join().unwrap().all_succeeded());
-    drop(group);
-    arm.deregister().unwrap();
+    drop((rover, arm));
+    domain.close().wait();
 }
 
 #[test]
-fn blocking_calls_work_without_a_runtime() {
+fn waits_work_without_a_runtime() {
     converse(&config(&[]));
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn blocking_calls_work_on_a_thread_of_a_runtime() {
+async fn waits_work_on_a_thread_of_a_runtime() {
     // On a worker, on a thread for blocking calls, and on the only thread of a runtime.
     converse(&config(&[]));
     let blocking = tokio::task::spawn_blocking(|| converse(&config(&[])));
@@ -359,59 +359,8 @@ async fn blocking_calls_work_on_a_thread_of_a_runtime() {
         runtime.block_on(async { converse(&config(&[])) });
     });
     current.join().unwrap();
-    let domain = blocking::Domain::open(&config(&[])).unwrap();
-    let rover = domain.register("rover").unwrap();
-    domain.close();
-    assert!(matches!(rover.receive(), Err(ReceiveError::Closed)));
-}
-
-/// The names of the public functions of the implementations of `subject` in this source.
-fn functions(source: &str, subject: &str, found: &mut BTreeSet<String>) {
-    let begin = format!("\nimpl {subject} {{\n");
-    for block in source.split(&begin).skip(1) {
-        let block = block.split("\n}\n").next().unwrap_or(block);
-        for line in block.lines() {
-            let line = line.strip_prefix("    pub ").unwrap_or_default();
-            let line = line.strip_prefix("async ").unwrap_or(line);
-            if let Some(function) = line.strip_prefix("fn ") {
-                let name = function.split(['(', '<']).next().unwrap_or_default();
-                found.insert(name.to_owned());
-            }
-        }
-    }
-}
-
-/// Adds the functions in the sources of this directory. `is_blocking` selects those of the module
-/// `blocking`.
-fn functions_below(
-    directory: &Path,
-    is_blocking: bool,
-    subject: &str,
-    found: &mut BTreeSet<String>,
-) {
-    for file in std::fs::read_dir(directory).unwrap() {
-        let path = file.unwrap().path();
-        if path.is_dir() {
-            functions_below(&path, is_blocking, subject, found);
-        } else if path.extension().is_some_and(|it| it == "rs")
-            && path.components().any(|part| {
-                let part = part.as_os_str();
-                part == "blocking" || part == "blocking.rs"
-            }) == is_blocking
-        {
-            functions(&std::fs::read_to_string(path).unwrap(), subject, found);
-        }
-    }
-}
-
-#[test]
-fn async_and_blocking_have_the_same_calls() {
-    let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
-    for subject in ["Domain", "Agent"] {
-        let [mut asynchronous, mut blocking] = [BTreeSet::new(), BTreeSet::new()];
-        functions_below(&sources, false, subject, &mut asynchronous);
-        functions_below(&sources, true, subject, &mut blocking);
-        assert!(asynchronous.len() > 8, "{asynchronous:?}");
-        assert_eq!(asynchronous, blocking, "of {subject}");
-    }
+    let domain = Domain::open(&config(&[])).wait().unwrap();
+    let rover = domain.register("rover").wait().unwrap();
+    domain.close().wait();
+    assert!(matches!(rover.receive().wait(), Err(ReceiveError::Closed)));
 }

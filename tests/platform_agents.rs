@@ -11,7 +11,7 @@ use std::time::{Duration, SystemTime};
 use fipa::platform::{
     AgentDescription, AmsDescription, Df, Exception, PlatformError, ServiceDescription, limits,
 };
-use fipa::{AgentId, Config, Domain, Gateway, Kind, Message, Performative, Reach, Time, blocking};
+use fipa::{AgentId, Config, Domain, Gateway, Kind, Message, Performative, Reach, Time};
 use fipa_sds::{Directory as _, EXCHANGE_ONTOLOGY, MdnsConfig, MdnsDirectory, MtsId, Registration};
 use fipa_testbed::until_async;
 use fipa_transport::Incarnation;
@@ -652,28 +652,4 @@ async fn the_configuration_names_the_agents_and_turns_them_off() {
     drop(rover);
     domain.close().await;
     gateway.close().await;
-}
-
-#[test]
-fn a_process_without_a_runtime_uses_the_same_calls() {
-    let config = config(&[]);
-    let runtime = tokio::runtime::Runtime::new().unwrap();
-    let gateway = runtime.block_on(Gateway::open(&config)).unwrap();
-    let domain = blocking::Domain::open(&config).unwrap();
-    let crane = domain.register("crane").unwrap();
-    let rover = domain.register("rover").unwrap();
-    let mut notifications = rover.df().unwrap().subscribe(&lifting()).unwrap();
-    let service = ServiceDescription::new("lift-1", "lifting");
-    let df = crane.df().unwrap();
-    df.register_service(service).unwrap();
-    assert_eq!(notifications.next().unwrap().len(), 1);
-    assert_eq!(df.search(&lifting()).unwrap().len(), 1);
-    df.deregister().unwrap();
-    assert!(notifications.next().unwrap()[0].services.is_empty());
-    notifications.cancel(TIMEOUT).unwrap();
-    let ams = rover.ams().unwrap();
-    assert_eq!(ams.description().unwrap().name, gateway.name());
-    drop((crane, rover));
-    domain.close();
-    runtime.block_on(gateway.close());
 }

@@ -13,10 +13,10 @@ use std::thread;
 use std::time::Duration;
 
 use common::Host;
-use fipa::Config;
-use fipa::blocking::{Domain, Side};
+use fipa::blocking::{Wait, on_thread};
 use fipa::config::Sources;
 use fipa::protocol::{DialogueError, Reply, Task};
+use fipa::{Config, Domain};
 use fipa_acl::is_unprintable;
 use fipa_testbed::{ChildGuard, ignored_test, until};
 use serde_json::{Value, json};
@@ -38,49 +38,55 @@ fn inside_agents() {
         ],
         ..Sources::default()
     });
-    let domain = Domain::open(&config.unwrap()).unwrap();
+    let domain = Domain::open(&config.unwrap()).wait().unwrap();
     let mut servers = Vec::new();
     let mut arms = Vec::new();
     for (name, price) in [("arm_1", "30"), ("arm_2", "10"), ("arm_3", "20")] {
-        let arm = domain.register(name).unwrap();
-        servers.push(arm.serve("fipa-request", act).unwrap());
-        let bid = move |mut task: Side<Task>| match task.propose(price, TIMEOUT)? {
-            true => Ok::<_, DialogueError>(Reply::Inform("carried".into())),
-            false => {
-                mark(&format!("rejected-{name}"));
-                Ok(Reply::Nothing)
+        let arm = domain.register(name).wait().unwrap();
+        servers.push(
+            arm.serve("fipa-request", |task| on_thread(|| act(task)))
+                .unwrap(),
+        );
+        let bid = move |mut task: Task| async move {
+            match task.propose(price, TIMEOUT).await? {
+                true => Ok::<_, DialogueError>(Reply::Inform("carried".into())),
+                false => {
+                    mark(&format!("rejected-{name}"));
+                    Ok(Reply::Nothing)
+                }
             }
         };
         servers.push(arm.serve("fipa-contract-net", bid).unwrap());
         arms.push(arm);
     }
-    let battery = domain.register("battery").unwrap();
+    let battery = domain.register("battery").wait().unwrap();
     let charge = battery.publisher("charge").unwrap();
     mark("ready");
     loop {
-        charge.publish("80.5");
+        charge.publish("80.5").wait();
         thread::sleep(Duration::from_millis(20));
     }
 }
 
 /// Handles a request, depending on its content.
-fn act(mut task: Side<Task>) -> Result<Reply, DialogueError> {
+fn act(mut task: Task) -> Result<Reply, DialogueError> {
     let action = task.message().text();
     match action.as_str() {
         "refuse" => return Ok(Reply::Refuse("too heavy".into())),
         "hostile" => return Ok(Reply::Refuse(HOSTILE.into())),
         "explain" => return Ok(Reply::Refuse(long_reason().into())),
-        _ => task.agree("")?,
+        _ => task.agree("").wait()?,
     }
     match action.as_str() {
         "fail" => Ok(Reply::Failure("it fell".into())),
         "fail at length" => Ok(Reply::Failure(long_reason().into())),
         "wait" => {
-            if !task.cancelled(TIMEOUT)? {
-                return Ok(Reply::Failure("no cancel".into()));
+            match task.cancelled().wait_within(TIMEOUT) {
+                Some(canceled) => canceled?,
+                None => return Ok(Reply::Failure("no cancel".into())),
             }
             mark("canceled");
-            task.confirm_cancel()
+            task.confirm_cancel().wait()
         }
         _ => Ok(Reply::Inform("lifted".into())),
     }

@@ -9,9 +9,11 @@ use std::net::TcpStream;
 use std::time::Duration;
 
 use common::{Host, Running};
-use fipa::blocking::{Agent, Domain};
+use fipa::blocking::Wait;
 use fipa::config::Sources;
-use fipa::{AgentId, Config, Envelope, EnvelopeParams, Letter, Message, Performative};
+use fipa::{
+    Agent, AgentId, Config, Domain, Envelope, EnvelopeParams, Letter, Message, Performative,
+};
 use fipa_acl::AclRepresentation;
 
 /// Time limit of all waits, which a passing test does not reach.
@@ -84,29 +86,29 @@ fn a_sender_that_takes_no_answers_does_not_delay_the_answers_to_others() {
             .to_vec(),
         ..Sources::default()
     });
-    let domain = Domain::open(&config.unwrap()).unwrap();
-    let [silent, honest] = ["silent", "honest"].map(|name| domain.register(name).unwrap());
+    let domain = Domain::open(&config.unwrap()).wait().unwrap();
+    let [silent, honest] = ["silent", "honest"].map(|name| domain.register(name).wait().unwrap());
     let question = |agent: &Agent, number: usize| {
         let question = agent
             .message(Performative::QueryRef)
             .receiver("echo")
             .content(number.to_string());
-        let deliveries = agent.send(question).unwrap();
+        let deliveries = agent.send(question).wait().unwrap();
         assert!(deliveries.all_succeeded(), "{deliveries}");
     };
     for number in 0..QUESTIONS {
         question(&silent, number);
     }
     question(&honest, 7);
-    let answer = honest.receive_within(TIMEOUT).unwrap();
+    let answer = honest.receive_within(TIMEOUT).wait().unwrap();
     assert_eq!(answer.unwrap().message().text(), "7");
     for number in 0..QUESTIONS {
-        let answer = silent.receive_within(TIMEOUT).unwrap();
+        let answer = silent.receive_within(TIMEOUT).wait().unwrap();
         assert_eq!(answer.unwrap().message().text(), number.to_string());
     }
     // A killed process would leave its files in the directory of this user.
     let (code, log) = echo.signal("-INT");
     assert_eq!(code, Some(0), "{log}");
     drop((silent, honest));
-    domain.close();
+    domain.close().wait();
 }

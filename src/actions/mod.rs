@@ -2,8 +2,7 @@
 //!
 //! [`Agent::offer`] offers an action; a handler runs each goal. [`Agent::robot`] is another agent whose
 //! actions this agent uses: [`Robot::actions`] lists them, and [`Robot::invoke`] sends a goal and returns
-//! its handle, with the progress, the result and the cancel. [`blocking`](crate::blocking) has the same
-//! calls for processes without an async runtime.
+//! its handle, with the progress, the result and the cancel.
 //!
 //! ```no_run
 //! use fipa::actions::{Action, Execution, Progress};

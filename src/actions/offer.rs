@@ -179,8 +179,8 @@ impl Drop for Offer {
 }
 
 impl Agent {
-    /// Offers an action. The handler runs each admitted goal in a task of its own on the current tokio
-    /// runtime, and returns the result. `G` is a struct whose fields are the parameters, a map, or `()`;
+    /// Offers an action. The handler runs each admitted goal in a task of its own on the tokio
+    /// runtime of the domain, and returns the result. `G` is a struct whose fields are the parameters, a map, or `()`;
     /// a goal that is not a `G` is refused and does not reach the handler. See
     /// [`actions`](crate::actions).
     ///
@@ -188,7 +188,7 @@ impl Agent {
     /// servers, the earlier gets a message that fits both.
     ///
     /// # Errors
-    /// If the description cannot be used or does not fit `G`, or the call is made outside a tokio runtime.
+    /// If the description cannot be used or does not fit `G`.
     pub fn offer<G, R, H, F, E>(&self, action: Action, handler: H) -> Result<Offer, OfferError>
     where
         G: DeserializeOwned + Send + 'static,
@@ -197,7 +197,6 @@ impl Agent {
         F: Future<Output = Result<R, E>> + Send + 'static,
         E: Display,
     {
-        tokio::runtime::Handle::try_current().map_err(|_| DialogueError::NoRuntime)?;
         let Action {
             description,
             mut options,

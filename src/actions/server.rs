@@ -39,7 +39,8 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<(), DialogueError> {
         let server = serve_those(core, protocol, is_about_actions, handler)?;
         servers.push(Box::new(server));
     }
-    core.actions.keep(servers);
+    let runtime = &core.endpoint.domain.inner.service.runtime;
+    core.actions.keep(servers, runtime);
     Ok(())
 }
 

@@ -175,9 +175,9 @@ impl ActionTable {
     }
 
     /// Keeps the servers of the agent, and starts the timers.
-    pub(crate) fn keep(&self, servers: Vec<Box<dyn Any + Send>>) {
+    pub(crate) fn keep(&self, servers: Vec<Box<dyn Any + Send>>, runtime: &Handle) {
         let shared = Arc::clone(&self.0);
-        let timers = tokio::spawn(run_timers(Self(shared))).abort_handle();
+        let timers = runtime.spawn(run_timers(Self(shared))).abort_handle();
         let mut state = self.0.state.lock();
         state.servers = servers;
         state.timers = Some(timers);

@@ -102,8 +102,6 @@ impl Domain {
     /// Waits for other processes that change the directory on a thread for blocking calls, up to a
     /// minute. Dropping the future ends the wait; the name is then not registered, or is removed
     /// again if it already was.
-    /// [`blocking::Domain::register_with`](crate::blocking::Domain::register_with) is the blocking
-    /// call.
     ///
     /// # Errors
     /// If the name is invalid or another agent has it, or if the directory cannot be written.

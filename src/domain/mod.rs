@@ -105,7 +105,6 @@ impl Domain {
     ///
     /// Waits for other processes on a thread for blocking calls, up to a minute. Dropping the future
     /// ends the wait, and the process leaves the domain again.
-    /// [`blocking::Domain::open`](crate::blocking::Domain::open) is the blocking call.
     ///
     /// # Errors
     /// If the configuration is invalid, if the directory of the domain cannot be used, or if no

@@ -2,7 +2,7 @@
 //!
 //! Every gateway runs both. [`Agent::df`] and [`Agent::ams`] use those of this host;
 //! [`Agent::df_of`] and [`Agent::ams_of`] use those of any platform, for example of another robot or of
-//! JADE. [`blocking`](crate::blocking) has the same calls for processes without an async runtime.
+//! JADE.
 //!
 //! ```no_run
 //! use fipa::platform::{AgentDescription, ServiceDescription};

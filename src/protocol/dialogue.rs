@@ -91,9 +91,6 @@ pub enum DialogueError {
     /// The message does not begin a conversation of a known protocol with this agent.
     #[error("the message does not begin a protocol: {0}")]
     NotOpening(Box<Message>),
-    /// The call was made outside a tokio runtime.
-    #[error("no tokio runtime is running; call this within one, or use fipa::blocking")]
-    NoRuntime,
     /// The other side sent a message that the protocol allows but the call does not expect.
     #[error("received a message that this call does not expect: {0}")]
     Unexpected(Box<Message>),

@@ -7,7 +7,6 @@
 //! passes a received opening message to [`Agent::take_part`], agrees, works and replies;
 //! [`Agent::serve`] runs a handler for each opening message, and [`Agent::publisher`] notifies all
 //! subscribers to a topic. Messages of other conversations still go to [`Agent::receive`].
-//! [`blocking`](crate::blocking) has the same calls for processes without an async runtime.
 //!
 //! # Partners that are gone or unreachable
 //!

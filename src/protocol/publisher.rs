@@ -7,7 +7,6 @@ use bytes::Bytes;
 use fipa_acl::{ErrorChain, Message, Performative, escape_name};
 use fipa_transport::{FailureReason, log_limit};
 use parking_lot::Mutex;
-use tokio::runtime::Handle;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
 
@@ -46,13 +45,13 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// If the call is made outside a tokio runtime.
+    /// If the protocol library of the configuration has no `fipa-subscribe`.
     pub fn publisher(&self, topic: impl Into<Bytes>) -> Result<Publisher, DialogueError> {
         let topic: Bytes = topic.into();
         let opens = opening(&self.core, "fipa-subscribe", move |message| {
             message.content().is_some_and(|content| *content == topic)
         })?;
-        let runtime = Handle::try_current().map_err(|_| DialogueError::NoRuntime)?;
+        let runtime = &self.core.endpoint.domain.inner.service.runtime;
         let subscribers = Arc::new(Subscribers::default());
         let queue = ServedQueue::new(&self.core, opens);
         let task = runtime.spawn(accept(queue, Arc::clone(&subscribers)));

@@ -6,7 +6,6 @@ use std::sync::Arc;
 use fipa_acl::{ErrorChain, Message, escape};
 use fipa_transport::log_limit;
 use parking_lot::Mutex;
-use tokio::runtime::Handle;
 use tokio::task::{JoinError, JoinHandle};
 
 use super::dialogue::{DialogueError, opens};
@@ -47,7 +46,7 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// If the protocol is unknown, or the call is made outside a tokio runtime.
+    /// If the protocol is unknown.
     pub fn serve<H, F, E>(&self, protocol: &str, handler: H) -> Result<Server, DialogueError>
     where
         H: Fn(Task) -> F + Send + Sync + 'static,
@@ -71,7 +70,7 @@ where
     E: Display + Send + 'static,
 {
     let opens = opening(core, protocol, also)?;
-    let runtime = Handle::try_current().map_err(|_| DialogueError::NoRuntime)?;
+    let runtime = &core.endpoint.domain.inner.service.runtime;
     let running = PeerPlaces::new(MAX_HANDLERS);
     let queue = ServedQueue::new(core, opens);
     let run = run(queue, handler, running.clone());

@@ -17,6 +17,7 @@ use fipa::actions::{
     Action, ActionError, Execution, Failure, Goal, GoalState, OfferError, ParameterDescription,
     Policy, Progress, Refusal, Type,
 };
+use fipa::blocking::{Wait, on_thread};
 use fipa::protocol::DialogueError;
 use fipa::{AgentId, Domain, FailureReason, Performative};
 use fipa_testbed::until_async;
@@ -647,42 +648,45 @@ async fn the_example_works() {
 }
 
 #[test]
-fn blocking_calls_do_the_same() {
+fn handlers_that_block_run_on_threads() {
     let config = patient();
-    let open = || fipa::blocking::Domain::open(&config).unwrap();
+    let open = || Domain::open(&config).wait().unwrap();
     let (here, there) = (open(), open());
-    let robot = here.register("crex").unwrap();
-    let _offer = robot
+    let robot = here.register("crex").wait().unwrap();
+    let _dock = robot
         .offer(dock(), |goal: Dock, run: Execution| {
-            run.progress(Progress::fraction(0.5));
-            Ok::<_, String>(Docked {
-                charge: goal.target.x,
+            on_thread(move || {
+                run.progress(Progress::fraction(0.5));
+                Ok::<_, String>(Docked {
+                    charge: goal.target.x,
+                })
             })
         })
         .unwrap();
     let _drive = robot
         .offer(Action::new("drive"), |(): (), run: Execution| {
-            while run.stop_cause().is_none() {
-                std::thread::sleep(Duration::from_millis(5));
-            }
-            Err::<(), _>("stopped")
+            on_thread(move || {
+                while run.stop_cause().is_none() {
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+                Err::<(), _>("stopped")
+            })
         })
         .unwrap();
-    let rover = there.register("rover").unwrap();
+    let _jump = robot
+        .offer(Action::new("jump"), |(): (), _: Execution| {
+            on_thread(|| -> Result<(), String> { panic!("too high") })
+        })
+        .unwrap();
+    let rover = there.register("rover").wait().unwrap();
     let crex = rover.robot(crex());
-    assert_eq!(crex.actions().unwrap().len(), 2);
-    let goal = crex.invoke("dock", &target()).unwrap();
-    let mut progress = goal.progress().unwrap();
-    let mut last = None;
-    while let Some(status) = progress.next().unwrap() {
-        last = Some(status);
-    }
-    let last = last.unwrap();
-    assert_eq!(last.state, GoalState::Done);
-    assert_eq!(last.progress.unwrap().fraction, Some(0.5));
-    let docked: Docked = goal.result().unwrap();
+    let mut drive = crex.invoke("drive", &()).wait().unwrap();
+    let docked = crex.invoke("dock", &target()).wait().unwrap();
+    let docked: Docked = docked.result().wait().unwrap();
     assert_eq!(docked.charge, 1.5);
-    let mut goal = crex.invoke("drive", &()).unwrap();
-    assert!(goal.cancel(TIMEOUT).unwrap());
-    assert_eq!(crex.status().unwrap(), []);
+    assert!(drive.cancel(TIMEOUT).wait().unwrap());
+    let jump = crex.invoke("jump", &()).wait().unwrap();
+    let jumped = jump.result::<()>().wait().unwrap_err().to_string();
+    assert!(jumped.contains("panicked: too high"), "{jumped}");
+    assert_eq!(crex.status().wait().unwrap(), []);
 }

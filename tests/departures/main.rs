@@ -13,6 +13,7 @@ mod support;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use fipa::blocking::Wait;
 use fipa::protocol::{DialogueError, PartnerEvent};
 use fipa::{Agent, AgentId, Domain, Gateway, Message, MessageBuilder, Performative};
 use process::Process;
@@ -164,21 +165,21 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
 #[test]
 fn a_killed_partner_ends_a_blocking_call() {
     let host = host(&[]);
-    let domain = fipa::blocking::Domain::open(&support::load(host.clone())).unwrap();
-    let rover = domain.register("rover").unwrap();
+    let domain = Domain::open(&support::load(host.clone())).wait().unwrap();
+    let rover = domain.register("rover").wait().unwrap();
     let mut arm = Process::start("arm", &host);
     let receiver = AgentId::new("arm").unwrap();
     let lift = rover
         .message(Performative::Request)
         .receiver(receiver.clone());
-    let mut request = rover.request(lift, TIMEOUT).unwrap();
-    assert!(request.agreed().unwrap());
+    let mut request = rover.request(lift, TIMEOUT).wait().unwrap();
+    assert!(request.agreed().wait().unwrap());
     let charge = rover.message(Performative::Subscribe).receiver(receiver);
-    let mut charge = rover.subscribe(charge, TIMEOUT).unwrap();
-    assert_eq!(text(&charge.next().unwrap()), "first");
-    let waiting = std::thread::spawn(move || charge.next());
+    let mut charge = rover.subscribe(charge, TIMEOUT).wait().unwrap();
+    assert_eq!(text(&charge.next().wait().unwrap()), "first");
+    let waiting = std::thread::spawn(move || charge.next().wait());
     arm.kill();
-    gone(&request.result(), "arm");
+    gone(&request.result().wait(), "arm");
     gone(&waiting.join().unwrap(), "arm");
 }
 
@@ -252,7 +253,7 @@ impl Drop for TwoHosts {
     fn drop(&mut self) {
         self.far.kill();
         let there = support::load(self.there.clone());
-        let opened = std::thread::spawn(move || fipa::blocking::Domain::open(&there).is_ok());
+        let opened = std::thread::spawn(move || Domain::open(&there).wait().is_ok());
         assert!(opened.join().unwrap_or(false), "files are left");
     }
 }

@@ -735,43 +735,6 @@ async fn a_malicious_peer_cannot_stop_others() {
     .await;
 }
 
-#[test]
-fn the_blocking_calls_do_the_same() {
-    let config = config(&[]);
-    let files = tempfile::tempdir().unwrap();
-    let domain = fipa::blocking::Domain::open(&config).unwrap();
-    let (crane, rover) = (
-        domain.register("crane").unwrap(),
-        domain.register("rover").unwrap(),
-    );
-    for agent in [&crane, &rover] {
-        agent.use_locks(options(Algorithm::default())).unwrap();
-    }
-    let bay = crane.own("bay", kept(&files, FOREVER)).unwrap();
-    let lock = rover.lock("bay").unwrap();
-    assert!(bay.admit(lock.fence().unwrap()));
-    assert!(lock.lost_within(Duration::from_millis(10)).is_none());
-    let granted = bay.next_within(Duration::from_secs(60));
-    assert!(matches!(granted, Some(OwnerEvent::Granted { .. })));
-    let late = crane.lock_within("bay", Duration::from_millis(50));
-    assert!(matches!(late, Err(LockError::TimedOut { .. })));
-    assert!(matches!(
-        crane.try_lock("bay"),
-        Err(LockError::TimedOut { .. })
-    ));
-    let listed = rover.query_locks(Duration::from_secs(60)).unwrap();
-    assert_eq!(listed[0].holder.as_deref(), Some("rover"));
-    lock.release();
-    drop(crane.lock_all(&["bay"]).unwrap());
-    drop(
-        rover
-            .lock_all_within(&["bay"], Duration::from_secs(60))
-            .unwrap(),
-    );
-    assert_eq!(crane.locks().len(), 1);
-    bay.release();
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn the_example_refuses_late_commands() {
     watched(async {

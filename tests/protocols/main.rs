@@ -2,8 +2,8 @@
 //! process is a membership of its own, here in one test process.
 //!
 //! This file has the protocols with one participant and the contract net. `selling.rs` has auctions
-//! and the iterated contract net, `proxies.rs` brokering and recruiting, and `blocking.rs` the blocking
-//! calls of all protocols.
+//! and the iterated contract net, `proxies.rs` brokering and recruiting, and `blocking.rs` the sides
+//! that are threads without a runtime.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 

@@ -74,28 +74,6 @@ async fn a_moved_agent_continues_its_conversations_and_is_checked() {
     assert!(next_message(&arm).await.unwrap().violation().is_some());
 }
 
-#[test]
-fn a_blocking_agent_takes_its_conversations_along() {
-    let config = config(&["monitor.check=enforce"]);
-    let domain = fipa::blocking::Domain::open(&config).unwrap();
-    let rover = domain.register("rover").unwrap();
-    let arm = domain.register("arm").unwrap();
-    let request = rover
-        .message(Performative::Request)
-        .receiver(arm.id().clone());
-    let request = request.protocol("fipa-request").conversation_id("c");
-    assert!(rover.send(request).unwrap().all_succeeded());
-    let mut departure = arm.depart().unwrap();
-    let asked = departure.take_unread().remove(0).into_message();
-    let conversations = departure.conversations();
-    let arm = domain.register("arm").unwrap();
-    assert_eq!(arm.restore_conversations(&conversations).unwrap(), 1);
-    let propose = arm.reply(&asked, Performative::Propose);
-    assert!(matches!(arm.send(propose), Err(SendError::Violation(_))));
-    let agree = arm.reply(&asked, Performative::Agree);
-    assert!(arm.send(agree).unwrap().all_succeeded());
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn without_checks_there_are_no_states() {
     let (here, _) = two(&[]).await;
