@@ -127,7 +127,7 @@ pub(crate) struct Unsettled {
 }
 
 impl Checks {
-    /// See [`Agent::expect_conversation`](crate::Agent::expect_conversation).
+    /// See [`Protocols::expect_conversation`](crate::protocol::Protocols::expect_conversation).
     pub(crate) fn expect_conversation(&self, id: &str) {
         if let Some(monitored) = &self.0 {
             monitored.monitor.lock().expect(id);
@@ -142,7 +142,7 @@ impl Checks {
         })
     }
 
-    /// See [`Agent::restore_conversations`](crate::Agent::restore_conversations).
+    /// See [`Protocols::restore_conversations`](crate::protocol::Protocols::restore_conversations).
     pub(crate) fn restore_conversations(
         &self,
         conversations: &[u8],
@@ -155,7 +155,7 @@ impl Checks {
         }
     }
 
-    /// See [`Agent::set_history`](crate::Agent::set_history).
+    /// See [`Protocols::set_history`](crate::protocol::Protocols::set_history).
     pub(crate) fn set_history(&self, history: History) {
         if let Some(monitored) = &self.0 {
             *monitored.earlier.lock() = None;

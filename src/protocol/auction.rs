@@ -8,12 +8,13 @@ use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 
 use super::bids::{Bids, Next};
 use super::dialogue::{Dialogue, DialogueError, after, name_of, settle, unreached};
+use super::protocols::Protocols;
 use super::reachability::Reachability;
 use super::receivers::expand;
+use crate::agent::AgentCore;
 use crate::agent::delivery::Sent;
-use crate::agent::{Agent, AgentCore};
 
-impl Agent {
+impl Protocols<'_> {
     /// Opens an English auction (FIPA00031), in which the price rises. The message, an `inform`,
     /// announces it to the bidders. Bidders that cannot be reached, or are gone, are left out.
     ///
@@ -27,7 +28,7 @@ impl Agent {
     ///
     /// let bidders = ["arm_1", "arm_2"].map(AgentId::new).into_iter().collect::<Result<Vec<_>, _>>()?;
     /// let opening = agent.message(Performative::Inform).content("(for-sale crate)");
-    /// let mut auction = agent.english_auction(opening, &bidders).await?;
+    /// let mut auction = agent.protocols().english_auction(opening, &bidders).await?;
     /// for price in 10.. {
     ///     let bids = auction.call(price.to_string(), Duration::from_secs(1)).await?;
     ///     let Some(first) = bids.proposals.first() else { break };
@@ -45,11 +46,11 @@ impl Agent {
     /// # Errors
     /// If the message does not begin the protocol, or cannot be sent.
     pub async fn english_auction(
-        &self,
+        self,
         opening: MessageBuilder,
         bidders: &[AgentId],
     ) -> Result<Auction, DialogueError> {
-        Auction::open(&self.core, "fipa-auction-english", opening, bidders).await
+        Auction::open(self.core, "fipa-auction-english", opening, bidders).await
     }
 
     /// Opens a Dutch auction (FIPA00032), in which the price falls until an agent bids, and which
@@ -58,11 +59,11 @@ impl Agent {
     /// # Errors
     /// See [`english_auction`](Self::english_auction).
     pub async fn dutch_auction(
-        &self,
+        self,
         opening: MessageBuilder,
         bidders: &[AgentId],
     ) -> Result<Auction, DialogueError> {
-        Auction::open(&self.core, "fipa-auction-dutch", opening, bidders).await
+        Auction::open(self.core, "fipa-auction-dutch", opening, bidders).await
     }
 }
 

@@ -10,6 +10,7 @@ use super::bids::{Bids, Next};
 use super::dialogue::{
     Dialogue, DialogueError, after, lost_by, name_of, only_delivered, settle, unreached,
 };
+use super::protocols::Protocols;
 use super::reachability::Reachability;
 use super::receivers::{expand, identified};
 use crate::agent::delivery::{Sent, deliveries};
@@ -53,14 +54,16 @@ impl Agent {
         let receivers = identified(receivers)?;
         ContractNet::begin(&self.core, "fipa-contract-net", call, &receivers, timeout).await
     }
+}
 
-    /// Calls for proposals like [`contract_net`](Self::contract_net), with the iterated protocol
+impl Protocols<'_> {
+    /// Calls for proposals like [`Agent::contract_net`], with the iterated protocol
     /// (FIPA00030), which allows further calls for better proposals ([`ContractNet::call_again`]).
     ///
     /// # Errors
-    /// See [`contract_net`](Self::contract_net).
+    /// See [`Agent::contract_net`].
     pub async fn iterated_contract_net<A>(
-        &self,
+        self,
         call: MessageBuilder,
         receivers: &[A],
         timeout: Duration,
@@ -70,7 +73,7 @@ impl Agent {
     {
         let protocol = "fipa-iterated-contract-net";
         let receivers = identified(receivers)?;
-        ContractNet::begin(&self.core, protocol, call, &receivers, timeout).await
+        ContractNet::begin(self.core, protocol, call, &receivers, timeout).await
     }
 }
 

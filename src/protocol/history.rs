@@ -5,6 +5,7 @@ use std::fmt;
 use fipa_monitor::{History, SnapshotError};
 use fipa_sds::DeregisterError;
 
+use super::protocols::Protocols;
 use crate::agent::checks::Checks;
 use crate::agent::{Agent, Unread};
 
@@ -22,7 +23,7 @@ impl Departure {
     }
 
     /// Returns the states of the agent's conversations, for
-    /// [`Agent::restore_conversations`] of its next registration. Empty if `monitor.check` is off.
+    /// [`Protocols::restore_conversations`] of its next registration. Empty if `monitor.check` is off.
     ///
     /// A letter that was sent before the departure may still have its outcome to come. Wait for the
     /// outcomes before this call: an undelivered message that is unknown to the next registration cannot
@@ -56,7 +57,7 @@ impl Agent {
     /// let conversations = departure.conversations();
     /// // The application transfers the bytes with its own state.
     /// let agent = there.register("arm").await?;
-    /// agent.restore_conversations(&conversations)?;
+    /// agent.protocols().restore_conversations(&conversations)?;
     /// # Ok(())
     /// # }
     /// ```
@@ -68,7 +69,9 @@ impl Agent {
         let unread = self.deregister()?;
         Ok(Departure { unread, checks })
     }
+}
 
+impl Protocols<'_> {
     /// Continues the checks of conversations of an earlier registration, of which
     /// [`Departure::conversations`] returned the states. Returns their number. Call this before the agent
     /// sends or receives a message.
@@ -80,7 +83,7 @@ impl Agent {
     /// If the bytes are malformed, are those of another agent, name a state that the protocols of this
     /// host do not have, or exceed `monitor.bytes`; or if the agent already has conversations. Nothing is
     /// changed, and messages of earlier conversations are not checked.
-    pub fn restore_conversations(&self, conversations: &[u8]) -> Result<usize, SnapshotError> {
+    pub fn restore_conversations(self, conversations: &[u8]) -> Result<usize, SnapshotError> {
         let checks = &self.core.endpoint.checks;
         checks.restore_conversations(conversations)
     }
@@ -92,7 +95,7 @@ impl Agent {
     /// Without this call, with `monitor.check` and unless `monitor.exempt` lists the protocol, such an
     /// answer [violates](crate::Incoming::violation) its protocol if its sender is on this host and was
     /// registered after this agent.
-    pub fn expect_conversation(&self, id: &str) {
+    pub fn expect_conversation(self, id: &str) {
         self.core.endpoint.checks.expect_conversation(id);
     }
 
@@ -100,11 +103,11 @@ impl Agent {
     /// under an earlier registration of its name.
     ///
     /// By default, an agent on this host that was registered after this one, and a conversation id of
-    /// [`unique_id`](Self::unique_id), cannot belong to such a conversation, and all others may. A
+    /// [`Agent::unique_id`], cannot belong to such a conversation, and all others may. A
     /// message that may continue such a conversation is not checked. An agent that restores its
     /// conversations after a restart sets [`History::Unknown`]: it is then not refused any message that
     /// continues one. An agent with a name that is never used again sets [`History::Complete`].
-    pub fn set_history(&self, history: History) {
+    pub fn set_history(self, history: History) {
         self.core.endpoint.checks.set_history(history);
     }
 }

@@ -7,6 +7,7 @@ use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 use fipa_monitor::Violation;
 
 use super::dialogue::{Dialogue, DialogueError, DialogueState, Interpreted, after, only_delivered};
+use super::protocols::Protocols;
 use super::reachability::Reachability;
 use super::receivers::single;
 use crate::agent::{Agent, AgentCore};
@@ -61,18 +62,20 @@ impl Agent {
     ) -> Result<Request, DialogueError> {
         Request::begin(&self.core, "fipa-query", query, timeout).await
     }
+}
 
+impl Protocols<'_> {
     /// Requests an action from an agent once a condition holds (`request-when`, FIPA00028); see
-    /// [`request`](Self::request).
+    /// [`Agent::request`].
     ///
     /// # Errors
-    /// See [`request`](Self::request).
+    /// See [`Agent::request`].
     pub async fn request_when(
-        &self,
+        self,
         request: MessageBuilder,
         timeout: Duration,
     ) -> Result<Request, DialogueError> {
-        Request::begin(&self.core, "fipa-request-when", request, timeout).await
+        Request::begin(self.core, "fipa-request-when", request, timeout).await
     }
 
     /// Proposes an action of this agent to another agent (`propose`, FIPA00036), and waits for the
@@ -82,13 +85,13 @@ impl Agent {
     /// If the message does not begin the protocol, is not delivered, or is not decided on within
     /// `timeout`.
     pub async fn propose(
-        &self,
+        self,
         proposal: MessageBuilder,
         timeout: Duration,
     ) -> Result<Decision, DialogueError> {
         let due = after(timeout);
-        let (proposal, _) = single(&self.core, proposal)?;
-        let opened = Dialogue::open(&self.core, "fipa-propose", proposal, due);
+        let (proposal, _) = single(self.core, proposal)?;
+        let opened = Dialogue::open(self.core, "fipa-propose", proposal, due);
         let (mut dialogue, sent) = opened.await?;
         only_delivered(&sent)?;
         let message = dialogue.receive(due).await?.message;

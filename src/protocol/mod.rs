@@ -1,9 +1,7 @@
 //! Interaction protocols as calls, so that applications need no state machines of their own.
 //!
-//! An initiator calls [`Agent::request`], [`Agent::query`], [`Agent::request_when`],
-//! [`Agent::propose`], [`Agent::subscribe`], [`Agent::contract_net`],
-//! [`Agent::iterated_contract_net`], [`Agent::english_auction`], [`Agent::dutch_auction`],
-//! [`Agent::brokering`] or [`Agent::recruiting`], and gets the result of the protocol. A participant
+//! An initiator calls [`Agent::request`], [`Agent::query`], [`Agent::subscribe`] or [`Agent::contract_net`],
+//! or one of the [`Protocols`] that few programs lead, and gets the result of the protocol. A participant
 //! passes a received opening message to [`Agent::take_part`], agrees, works and replies;
 //! [`Agent::serve`] runs a handler for each opening message, and [`Agent::publisher`] notifies all
 //! subscribers to a topic. Messages of other conversations still go to [`Agent::receive`].
@@ -36,7 +34,7 @@
 //!   independently of `monitor.check`.
 //! * `partners.rs` decides, without I/O, whether a partner is gone or unreachable; `watching.rs` is the
 //!   shell around it; `reachability.rs` reports it. `receivers.rs` expands patterns and coalitions.
-//! * `initiator.rs`, `subscription.rs`, `contract_net.rs`, `auction.rs` and `proxied.rs` are the sides
+//! * `protocols.rs` is the view of the rarer calls. `initiator.rs`, `subscription.rs`, `contract_net.rs`, `auction.rs` and `proxied.rs` are the sides
 //!   of initiators; `bids.rs` collects the answers to a call for proposals. `participant.rs` is the
 //!   side of participants; `serving.rs` and `publisher.rs` lead many of them.
 //!
@@ -51,6 +49,7 @@ mod initiator;
 mod participant;
 mod partners;
 pub(crate) mod peer_shares;
+mod protocols;
 mod proxied;
 mod publisher;
 mod reachability;
@@ -67,6 +66,7 @@ pub use history::Departure;
 pub use initiator::{Decision, Request};
 pub use participant::{Reply, Task};
 pub use partners::PartnerEvent;
+pub use protocols::Protocols;
 pub use proxied::Proxied;
 pub use publisher::Publisher;
 pub use reachability::{Reachability, Unreachable};

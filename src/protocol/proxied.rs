@@ -7,11 +7,12 @@ use std::time::{Duration, Instant};
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 
 use super::dialogue::{Dialogue, DialogueError, DialogueState, Interpreted, after, only_delivered};
+use super::protocols::Protocols;
 use super::reachability::Reachability;
 use super::receivers::single;
-use crate::agent::{Agent, AgentCore};
+use crate::agent::AgentCore;
 
-impl Agent {
+impl Protocols<'_> {
     /// Requests a broker to pass a message on to suitable agents and to forward their answers (`proxy`,
     /// FIPA00033). The content holds the message and the description of the agents. Waits until the
     /// broker has agreed and passed the message on.
@@ -25,7 +26,7 @@ impl Agent {
     ///     .message(Performative::Proxy)
     ///     .receiver(AgentId::new("broker")?)
     ///     .content("(any-arm (query-ref (load ?x)))");
-    /// let mut answers = agent.brokering(proxy, Duration::from_secs(5)).await?;
+    /// let mut answers = agent.protocols().brokering(proxy, Duration::from_secs(5)).await?;
     /// println!("{}", answers.next(Duration::from_secs(5)).await?);
     /// # Ok(())
     /// # }
@@ -35,11 +36,11 @@ impl Agent {
     /// If the message does not begin the protocol or is not delivered, or if the broker refuses, finds
     /// no agent ([`DialogueError::Failed`]) or does not answer within `timeout`.
     pub async fn brokering(
-        &self,
+        self,
         proxy: MessageBuilder,
         timeout: Duration,
     ) -> Result<Proxied, DialogueError> {
-        Proxied::begin(&self.core, "fipa-brokering", proxy, timeout).await
+        Proxied::begin(self.core, "fipa-brokering", proxy, timeout).await
     }
 
     /// Requests a recruiter to pass a message on to suitable agents (FIPA00034), which answer this agent
@@ -50,16 +51,16 @@ impl Agent {
     /// # Errors
     /// See [`brokering`](Self::brokering).
     pub async fn recruiting(
-        &self,
+        self,
         proxy: MessageBuilder,
         timeout: Duration,
     ) -> Result<Proxied, DialogueError> {
-        Proxied::begin(&self.core, "fipa-recruiting", proxy, timeout).await
+        Proxied::begin(self.core, "fipa-recruiting", proxy, timeout).await
     }
 }
 
 /// A message that a broker or recruiter has passed on. After dropping it, the answers go to
-/// [`Agent::receive`].
+/// [`Agent::receive`](crate::Agent::receive).
 #[derive(Debug)]
 #[must_use = "next() returns the answers"]
 pub struct Proxied {

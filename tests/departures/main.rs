@@ -76,19 +76,28 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
     let mut request = request.unwrap();
     assert!(request.agreed().await.unwrap());
     let query = rover.query(ask(Performative::QueryRef), TIMEOUT).await;
-    let when = rover.request_when(ask(Performative::RequestWhen), TIMEOUT);
+    let when = rover
+        .protocols()
+        .request_when(ask(Performative::RequestWhen), TIMEOUT);
     let when = when.await.unwrap();
     let charge = rover.subscribe(ask(Performative::Subscribe), TIMEOUT).await;
     let mut charge = charge.unwrap();
     assert_eq!(text(&patient(charge.next()).await.unwrap()), "first");
-    let proxy = rover.brokering(ask(Performative::Proxy), TIMEOUT).await;
+    let proxy = rover
+        .protocols()
+        .brokering(ask(Performative::Proxy), TIMEOUT)
+        .await;
     let mut proxied = proxy.unwrap();
     let arms = [AgentId::new("arm").unwrap()];
     let call = rover.message(Performative::Cfp);
     let mut net = rover.contract_net(call, &arms, TIMEOUT).await.unwrap();
     let bid = net.bids().proposals[0].clone();
     let opening = rover.message(Performative::Inform);
-    let mut auction = rover.english_auction(opening, &arms).await.unwrap();
+    let mut auction = rover
+        .protocols()
+        .english_auction(opening, &arms)
+        .await
+        .unwrap();
     let to_cancel = rover.request(ask(Performative::Request), TIMEOUT).await;
     let mut to_cancel = to_cancel.unwrap();
     assert!(to_cancel.agreed().await.unwrap());
@@ -96,7 +105,7 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
     let proposing = Arc::clone(&rover);
     let proposed = tokio::spawn(async move {
         let proposal = to(&proposing, Performative::Propose, "arm");
-        let decided = proposing.propose(proposal, TIMEOUT).await;
+        let decided = proposing.protocols().propose(proposal, TIMEOUT).await;
         (decided, Instant::now())
     });
     let awarded = tokio::spawn(async move {

@@ -123,14 +123,21 @@ async fn each_kind_of_answer_yields_its_result_or_error() {
         assert!(!query.agreed().await.unwrap());
         assert_eq!(text(&query.result().await.unwrap()), "42");
         let when = rover
+            .protocols()
             .request_when(ask(Performative::RequestWhen), TIMEOUT)
             .await;
         let mut when = when.unwrap();
         assert!(when.agreed().await.unwrap());
         assert!(matches!(when.result().await, Err(DialogueError::Failed(_))));
-        let decided = rover.propose(ask(Performative::Propose), TIMEOUT).await;
+        let decided = rover
+            .protocols()
+            .propose(ask(Performative::Propose), TIMEOUT)
+            .await;
         assert!(matches!(decided, Ok(Decision::Accepted(_))));
-        let decided = rover.propose(ask(Performative::Propose), TIMEOUT).await;
+        let decided = rover
+            .protocols()
+            .propose(ask(Performative::Propose), TIMEOUT)
+            .await;
         assert!(matches!(decided, Ok(Decision::Rejected(_))));
         // A message that does not begin the protocol is not sent.
         let wrong = rover.request(ask(Performative::Inform), TIMEOUT).await;

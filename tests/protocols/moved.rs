@@ -41,9 +41,14 @@ async fn a_moved_agent_continues_its_conversations_and_is_checked() {
     // Other bytes have no effect.
     let mut changed = conversations.clone();
     changed.truncate(changed.len() - 1);
-    assert!(arm.restore_conversations(&changed).is_err());
-    assert!(arm.restore_conversations(b"other").is_err());
-    assert_eq!(arm.restore_conversations(&conversations).unwrap(), 2);
+    assert!(arm.protocols().restore_conversations(&changed).is_err());
+    assert!(arm.protocols().restore_conversations(b"other").is_err());
+    assert_eq!(
+        arm.protocols()
+            .restore_conversations(&conversations)
+            .unwrap(),
+        2
+    );
 
     // An illegal continuation is refused: the arm has agreed, and has not agreed to the second request.
     for (message, act, kind) in [
@@ -82,5 +87,10 @@ async fn without_checks_there_are_no_states() {
     assert!(conversations.is_empty());
     let [checked, ..] = three().await;
     let arm = checked.register("arm").await.unwrap();
-    assert_eq!(arm.restore_conversations(&conversations).unwrap(), 0);
+    assert_eq!(
+        arm.protocols()
+            .restore_conversations(&conversations)
+            .unwrap(),
+        0
+    );
 }

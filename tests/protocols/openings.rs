@@ -113,7 +113,11 @@ async fn an_auction_reaches_the_members_of_a_coalition() {
     let auctioneer = async {
         let opening = rover.message(Performative::Inform);
         let to = ids(&["platoon", "arm_1"]);
-        let mut auction = rover.english_auction(opening, &to).await.unwrap();
+        let mut auction = rover
+            .protocols()
+            .english_auction(opening, &to)
+            .await
+            .unwrap();
         assert_eq!(auction.bidders(), ids(&["arm_1", "arm_2"]));
         let bids = auction.call("10", TIMEOUT).await.unwrap();
         assert_eq!(bids.proposals.len(), 2, "{bids:?}");
@@ -144,9 +148,17 @@ async fn the_bidders_of_an_auction_are_the_agents_that_its_receivers_stand_for()
     ] {
         let opening = || rover.message(Performative::Inform);
         let receivers = ids(receivers);
-        let english = rover.english_auction(opening(), &receivers).await.unwrap();
+        let english = rover
+            .protocols()
+            .english_auction(opening(), &receivers)
+            .await
+            .unwrap();
         assert_eq!(english.bidders(), ids(bidders));
-        let dutch = rover.dutch_auction(opening(), &receivers).await.unwrap();
+        let dutch = rover
+            .protocols()
+            .dutch_auction(opening(), &receivers)
+            .await
+            .unwrap();
         assert_eq!(dutch.bidders(), ids(bidders));
     }
 }
@@ -172,10 +184,12 @@ async fn a_request_needs_receivers_that_stand_for_one_agent() {
                 .err(),
             rover.query(to(Performative::QueryIf), TIMEOUT).await.err(),
             rover
+                .protocols()
                 .request_when(to(Performative::RequestWhen), TIMEOUT)
                 .await
                 .err(),
             rover
+                .protocols()
                 .propose(to(Performative::Propose), TIMEOUT)
                 .await
                 .err(),
@@ -184,10 +198,12 @@ async fn a_request_needs_receivers_that_stand_for_one_agent() {
                 .await
                 .err(),
             rover
+                .protocols()
                 .brokering(to(Performative::Proxy), TIMEOUT)
                 .await
                 .err(),
             rover
+                .protocols()
                 .recruiting(to(Performative::Proxy), TIMEOUT)
                 .await
                 .err(),

@@ -47,7 +47,7 @@ async fn a_broker_forwards_answers() {
     let [rover, broker, arm] = three("broker").await;
     let initiator = async {
         let proxy = proxy(&rover, &broker);
-        let mut answers = rover.brokering(proxy, TIMEOUT).await.unwrap();
+        let mut answers = rover.protocols().brokering(proxy, TIMEOUT).await.unwrap();
         let agreed = answers.next(TIMEOUT).await.unwrap();
         assert_eq!(*agreed.performative(), Performative::Agree);
         let informed = answers.next(TIMEOUT).await.unwrap();
@@ -94,7 +94,7 @@ async fn recruited_agents_answer_the_initiator_directly() {
     let [rover, recruiter, arm] = three("recruiter").await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
-        let mut answers = rover.recruiting(proxy, TIMEOUT).await.unwrap();
+        let mut answers = rover.protocols().recruiting(proxy, TIMEOUT).await.unwrap();
         for act in [Performative::Agree, Performative::Inform] {
             let answer = answers.next(TIMEOUT).await.unwrap();
             assert_eq!(*answer.performative(), act);
@@ -157,7 +157,7 @@ async fn the_initiator_accepts_the_proposal_of_a_recruited_agent() {
     let [rover, recruiter, arm] = three("recruiter").await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
-        let mut answers = rover.recruiting(proxy, TIMEOUT).await.unwrap();
+        let mut answers = rover.protocols().recruiting(proxy, TIMEOUT).await.unwrap();
         let proposal = answers.next(TIMEOUT).await.unwrap();
         assert_eq!(*proposal.performative(), Performative::Propose);
         let early = answers.answer(&proposal, Performative::Cfp, "", TIMEOUT);
@@ -178,7 +178,7 @@ async fn a_designated_receiver_accepts_the_proposal_of_a_recruited_agent() {
     let [rover, recruiter, arm, base] = enforcing(["rover", "recruiter", "arm", "base"]).await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
-        let _answers = rover.recruiting(proxy, TIMEOUT).await.unwrap();
+        let _answers = rover.protocols().recruiting(proxy, TIMEOUT).await.unwrap();
     };
     let designated = async {
         let proposal = next_message(&base).await.unwrap().into_message();
@@ -202,7 +202,7 @@ async fn recruited_agents_answer_the_designated_receiver() {
     let [rover, recruiter, arm, base] = enforcing(["rover", "recruiter", "arm", "base"]).await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
-        let _answers = rover.recruiting(proxy, TIMEOUT).await.unwrap();
+        let _answers = rover.protocols().recruiting(proxy, TIMEOUT).await.unwrap();
     };
     let goes_between = async {
         let first = next_message(&recruiter).await.unwrap();
@@ -226,12 +226,21 @@ async fn recruited_agents_answer_the_designated_receiver() {
 async fn a_broker_or_recruiter_may_refuse_or_find_no_agent() {
     let [rover, broker, _arm] = three("broker").await;
     let initiator = async {
-        let refused = rover.brokering(proxy(&rover, &broker), TIMEOUT).await;
+        let refused = rover
+            .protocols()
+            .brokering(proxy(&rover, &broker), TIMEOUT)
+            .await;
         assert!(matches!(refused.err(), Some(DialogueError::Refused(_))));
-        let none = rover.recruiting(proxy(&rover, &broker), TIMEOUT).await;
+        let none = rover
+            .protocols()
+            .recruiting(proxy(&rover, &broker), TIMEOUT)
+            .await;
         assert!(matches!(none.err(), Some(DialogueError::Failed(_))));
         let moment = Duration::from_secs(1);
-        let silent = rover.brokering(proxy(&rover, &broker), moment).await;
+        let silent = rover
+            .protocols()
+            .brokering(proxy(&rover, &broker), moment)
+            .await;
         assert!(matches!(silent.err(), Some(DialogueError::TimedOut)));
     };
     let goes_between = async {
@@ -255,7 +264,7 @@ async fn brokering_is_cancelled() {
     let [rover, broker, arm] = three("broker").await;
     let initiator = async {
         let proxy = proxy(&rover, &broker);
-        let answers = rover.brokering(proxy, TIMEOUT).await.unwrap();
+        let answers = rover.protocols().brokering(proxy, TIMEOUT).await.unwrap();
         answers.cancel(TIMEOUT).await.unwrap();
     };
     let goes_between = async {

@@ -52,6 +52,7 @@ async fn an_iterated_contract_net_calls_some_participants_again() {
     };
     let initiator = async {
         let mut net = rover
+            .protocols()
             .iterated_contract_net(cfp(&rover, "carry"), &called, TIMEOUT)
             .await
             .unwrap();
@@ -277,7 +278,11 @@ async fn the_last_bidder_wins_an_english_auction() {
     bidders.push(AgentId::new("unknown").unwrap());
     let auctioneer = async {
         let opening = rover.message(Performative::Inform).content("a crate");
-        let mut auction = rover.english_auction(opening, &bidders).await.unwrap();
+        let mut auction = rover
+            .protocols()
+            .english_auction(opening, &bidders)
+            .await
+            .unwrap();
         assert_eq!(auction.bidders(), ids(&arms));
         // Both bid, and one bid is accepted. The next call rejects the other one.
         let bids = auction.call("10", TIMEOUT).await.unwrap();
@@ -315,7 +320,11 @@ async fn a_dutch_auction_continues_while_goods_are_left() {
     let (rover, arms) = rover_and(["eager", "patient"]).await;
     let auctioneer = async {
         let opening = rover.message(Performative::Inform).content("a crate");
-        let mut auction = rover.dutch_auction(opening, &ids(&arms)).await.unwrap();
+        let mut auction = rover
+            .protocols()
+            .dutch_auction(opening, &ids(&arms))
+            .await
+            .unwrap();
         let mut sold = Vec::new();
         let mut price = 40;
         while sold.len() < 2 {
@@ -350,7 +359,11 @@ async fn an_auction_without_a_bid_has_no_winner() {
     let (rover, arms) = rover_and(["arm"]).await;
     let auctioneer = async {
         let opening = rover.message(Performative::Inform).content("a crate");
-        let mut auction = rover.english_auction(opening, &ids(&arms)).await.unwrap();
+        let mut auction = rover
+            .protocols()
+            .english_auction(opening, &ids(&arms))
+            .await
+            .unwrap();
         let moment = Duration::from_millis(300);
         assert!(
             auction
@@ -375,7 +388,11 @@ async fn a_bid_that_crosses_the_next_call_does_not_count() {
     let (first_over, ended) = tokio::sync::oneshot::channel();
     let auctioneer = async {
         let opening = rover.message(Performative::Inform).content("a crate");
-        let mut auction = rover.english_auction(opening, &ids(&arms)).await.unwrap();
+        let mut auction = rover
+            .protocols()
+            .english_auction(opening, &ids(&arms))
+            .await
+            .unwrap();
         let moment = Duration::from_millis(300);
         let bids = auction.call("10", moment).await.unwrap();
         assert_eq!(bids.silent, ["arm"]);

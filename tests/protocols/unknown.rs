@@ -48,11 +48,11 @@ async fn an_unsolicited_answer_is_a_violation_if_its_conversation_cannot_have_be
     let found = violation(&arm, answer(&arm, &rover, &next), &rover).await;
     assert_eq!(found, unsolicited);
     // Another agent names the rover in a `reply-to`.
-    rover.expect_conversation("e");
+    rover.protocols().expect_conversation("e");
     let designated = answer(&mallory, &rover, "e");
     assert_eq!(violation(&mallory, designated, &rover).await, None);
     // The rover restores its conversations.
-    rover.set_history(History::Unknown);
+    rover.protocols().set_history(History::Unknown);
     let restored = answer(&mallory, &rover, "f");
     assert_eq!(violation(&mallory, restored, &rover).await, None);
 }
@@ -79,7 +79,7 @@ async fn a_restarted_agent_may_continue_conversations_of_its_earlier_registratio
     );
     // The conversations of an agent with a new name begin with it.
     let other = here.register("other").await.unwrap();
-    other.set_history(History::Complete);
+    other.protocols().set_history(History::Complete);
     let to_rover = other.send(answer(&other, &rover, "e")).await;
     assert!(
         matches!(to_rover, Err(SendError::Violation(_))),

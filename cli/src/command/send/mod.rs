@@ -265,7 +265,7 @@ async fn register(
     let agent = membership::register(domain, &name, options, config).await?;
     if arguments.from.is_none() {
         // No earlier agent had this name.
-        agent.set_history(History::Complete);
+        agent.protocols().set_history(History::Complete);
     }
     Ok(agent)
 }
