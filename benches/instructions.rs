@@ -147,7 +147,7 @@ impl Pair {
 
     fn letters<S>(&self, len: usize, in_flight: usize, mut send: impl FnMut() -> S)
     where
-        S: Future<Output = Result<fipa::Deliveries, fipa::SendError>>,
+        S: Future<Output = Result<fipa::Deliveries, fipa::error::SendError>>,
     {
         for _ in 0..LETTERS / in_flight {
             let sent: Vec<_> = (0..in_flight).map(|_| send()).collect();

@@ -1,23 +1,36 @@
-//! Errors of joining a domain, sending and receiving.
+//! The errors of joining a domain, registering, sending and receiving.
+//!
+//! Each of them converts into [`Error`](crate::Error). The errors of a module, such as
+//! [`DialogueError`](crate::protocol::DialogueError), are in that module.
 
 #[cfg(feature = "protocols")]
 use std::path::PathBuf;
 
-use fipa_acl::BuildError;
+pub use fipa_acl::{
+    AgentIdError, BuildError, ContentError, DecodeError, EncodeError, ErrorChain,
+    PerformativeError, TimeError,
+};
 #[cfg(feature = "protocols")]
 use fipa_monitor::LibraryFull;
 #[cfg(feature = "protocols")]
 use fipa_monitor::scxml::ScxmlError;
-use fipa_mts::PostError;
+pub use fipa_mts::PostError;
 #[cfg(feature = "mdns")]
-use fipa_sds::MdnsError;
-use fipa_sds::{EntryError, HostError, RegisterError};
-use fipa_transport::{Forked, Kind, ListenError};
+pub use fipa_sds::MdnsError;
+pub use fipa_sds::{
+    DeregisterError, EntryError, HostError, MembersError, NameError, PatternError, RegisterError,
+};
+use fipa_transport::Kind;
+pub use fipa_transport::{
+    Forked, IncarnationError, ListenError, LocationError, TransportError, TransportErrorKind,
+};
 
 #[cfg(feature = "secure")]
 use crate::admin::keys::KeysError;
 use crate::config::{ConfigError, RuleError};
-use crate::domain::files::{DomainDir, DomainDirError};
+pub use crate::domain::coalition::CoalitionError;
+use crate::domain::files::DomainDir;
+pub use crate::domain::files::DomainDirError;
 
 /// The error of [`Domain::open`](crate::Domain::open) and of opening a gateway or a watcher.
 #[derive(Debug, thiserror::Error)]

@@ -110,7 +110,7 @@ mod any_error;
 pub mod blocking;
 pub mod config;
 mod domain;
-mod error;
+pub mod error;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing;
@@ -129,31 +129,20 @@ pub use agent::sender_tasks::SenderTasks;
 pub use agent::{Agent, Loan, Unread};
 pub use any_error::{Error, Result};
 pub use config::Config;
-pub use domain::coalition::{Coalition, CoalitionError};
+pub use domain::coalition::Coalition;
 pub use domain::directory_view::DirectoryView;
-pub use domain::files::DomainDirError;
 pub use domain::{Domain, RegisterOptions};
-#[cfg(feature = "protocols")]
-pub use error::ProtocolError;
-pub use error::{OpenError, ReceiveError, SendError};
 pub use fipa_acl::{
-    AgentId, AgentIdError, BuildError, ContentError, DecodeError, EncodeError, Envelope,
-    EnvelopeParams, ErrorChain, Letter, Message, MessageBuilder, Payload, Performative,
-    PerformativeError, Problem, Time, TimeError,
+    AgentId, Envelope, EnvelopeParams, Letter, Message, MessageBuilder, Payload, Performative,
+    Problem, Time,
 };
 #[cfg(feature = "protocols")]
 pub use fipa_monitor as monitor;
-pub use fipa_mts::{DeliveryFailure, PostError};
-#[cfg(feature = "mdns")]
-pub use fipa_sds::MdnsError;
+pub use fipa_mts::DeliveryFailure;
 pub use fipa_sds::{
-    Change, DeregisterError, Entry, EntryError, HostError, Matcher, Members, MembersError,
-    NameError, Pattern, PatternError, Query, Reach, RegisterError, Role, Source, Watch, is_pattern,
+    Change, Entry, Matcher, Members, Pattern, Query, Reach, Role, Source, Watch, is_pattern,
 };
-pub use fipa_transport::{
-    Attempt, FailureReason, Forked, Incarnation, IncarnationError, Kind, ListenError, Location,
-    LocationError, Outcome, Signature, TransportError, TransportErrorKind,
-};
+pub use fipa_transport::{Attempt, FailureReason, Incarnation, Kind, Location, Outcome, Signature};
 #[doc(hidden)]
 pub use fipa_transport::{fnv1a, log_limit, threads};
 #[cfg(feature = "net")]

@@ -8,9 +8,10 @@ mod support;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use fipa::error::TransportErrorKind;
 use fipa::{
     Agent, AgentId, Config, Domain, Entry, FailureReason, Gateway, Kind, Message, Outcome,
-    Performative, TransportErrorKind,
+    Performative,
 };
 use fipa_mts::letter_for;
 use fipa_transport::{

@@ -10,8 +10,9 @@ mod support;
 
 use std::time::Duration;
 
+use fipa::error::SendError;
 use fipa::protocol::{DialogueError, Reply, Task};
-use fipa::{Agent, AgentId, Config, Domain, Performative, SendError};
+use fipa::{Agent, AgentId, Config, Domain, Performative};
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
 

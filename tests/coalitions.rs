@@ -9,9 +9,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use fipa::error::CoalitionError;
 use fipa::{
-    Agent, AgentId, Change, Coalition, CoalitionError, Config, Deliveries, Domain, Entry,
-    FailureReason, Gateway, Kind, Members, Outcome, Performative, RegisterOptions, Role,
+    Agent, AgentId, Change, Coalition, Config, Deliveries, Domain, Entry, FailureReason, Gateway,
+    Kind, Members, Outcome, Performative, RegisterOptions, Role,
 };
 use fipa_testbed::until_async;
 use support::config;

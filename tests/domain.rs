@@ -9,9 +9,8 @@ use std::collections::HashSet;
 use std::time::Duration;
 
 use fipa::blocking::Wait;
-use fipa::{
-    AgentId, Deliveries, Domain, FailureReason, Kind, Outcome, Performative, RegisterError,
-};
+use fipa::error::RegisterError;
+use fipa::{AgentId, Deliveries, Domain, FailureReason, Kind, Outcome, Performative};
 use support::{config, inform, two};
 
 fn only(deliveries: &Deliveries) -> &Outcome {
@@ -508,7 +507,10 @@ async fn calls_after_closing_the_domain_fail_and_do_not_hang() {
             Err(error) => break error,
         }
     };
-    assert!(matches!(ended, fipa::ReceiveError::Closed), "{ended}");
+    assert!(
+        matches!(ended, fipa::error::ReceiveError::Closed),
+        "{ended}"
+    );
 }
 
 #[test]

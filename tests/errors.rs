@@ -5,11 +5,12 @@ use std::error::Error;
 use std::io;
 use std::sync::Arc;
 
+use fipa::Kind;
 use fipa::admin::routes::AskError;
 use fipa::config::ConfigError;
-use fipa::{
+use fipa::error::{
     CoalitionError, DeregisterError, DomainDirError, EncodeError, EntryError, ErrorChain,
-    HostError, Kind, ListenError, MembersError, NameError, OpenError, PostError, RegisterError,
+    HostError, ListenError, MembersError, NameError, OpenError, PostError, RegisterError,
     SendError,
 };
 
@@ -131,14 +132,14 @@ fn errors() -> Vec<(Box<dyn Error>, String)> {
     #[cfg(feature = "protocols")]
     all.extend([
         (
-            Box::new(fipa::ProtocolError::Read {
+            Box::new(fipa::error::ProtocolError::Read {
                 path: path(),
                 source: cause(),
             }) as Box<dyn Error>,
             format!("monitor.protocols: cannot read /dir: {CAUSE}"),
         ),
         (
-            Box::new(fipa::ProtocolError::Full(fipa::monitor::LibraryFull)),
+            Box::new(fipa::error::ProtocolError::Full(fipa::monitor::LibraryFull)),
             format!(
                 "monitor.protocols: too many protocols: {}",
                 fipa::monitor::LibraryFull

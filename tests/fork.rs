@@ -12,10 +12,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use fipa::blocking::Wait;
-use fipa::{
-    Agent, AgentId, Config, Domain, Forked, Incoming, Message, Performative, ReceiveError,
-    RegisterError, SendError,
-};
+use fipa::error::{Forked, ReceiveError, RegisterError, SendError};
+use fipa::{Agent, AgentId, Config, Domain, Incoming, Message, Performative};
 use fork::{Fork, fork, waitpid};
 
 /// Content that is large enough to be read in the sender's memory.

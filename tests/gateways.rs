@@ -9,9 +9,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa::admin::routes::{self, RouteState, Standing};
+use fipa::error::{ErrorChain, OpenError, TransportErrorKind};
 use fipa::{
-    Agent, Config, Deliveries, Domain, ErrorChain, FailureReason, Gateway, Kind, OpenError,
-    Outcome, Performative, Query, TransportErrorKind,
+    Agent, Config, Deliveries, Domain, FailureReason, Gateway, Kind, Outcome, Performative, Query,
 };
 use support::inform;
 

@@ -12,10 +12,8 @@ use std::time::Duration;
 
 use fipa::Performative::{Inform, Request};
 use fipa::blocking::Wait;
-use fipa::{
-    AgentIdError, BuildError, Change, Config, DeregisterError, Domain, FailureReason, Outcome,
-    ReceiveError, RegisterOptions, SendError,
-};
+use fipa::error::{AgentIdError, BuildError, DeregisterError, ReceiveError, SendError};
+use fipa::{Change, Config, Domain, FailureReason, Outcome, RegisterOptions};
 use fipa_testbed::until_async;
 use futures_core::Stream;
 use support::{inform, two};

@@ -10,10 +10,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use fipa::{
-    Agent, AgentId, Domain, FailureReason, Gateway, Incoming, Kind, Outcome, Performative,
-    RegisterError,
-};
+use fipa::error::RegisterError;
+use fipa::{Agent, AgentId, Domain, FailureReason, Gateway, Incoming, Kind, Outcome, Performative};
 use parking_lot::Mutex;
 use support::config;
 use tokio::sync::Semaphore;

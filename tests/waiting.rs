@@ -10,7 +10,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 use std::task::Poll;
 
-use fipa::{Change, Config, Domain, RegisterError};
+use fipa::error::RegisterError;
+use fipa::{Change, Config, Domain};
 
 /// Makes a configuration for a domain that no other test uses.
 fn config() -> Config {

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use fipa::ErrorChain;
+use fipa::error::ErrorChain;
 use thiserror::Error;
 
 /// A measurement that could not be made or shown.

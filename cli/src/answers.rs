@@ -1,6 +1,7 @@
 //! The answers of commands that run an agent.
 
-use fipa::{Agent, ErrorChain, Incoming, MessageBuilder, SenderTasks, log_limit};
+use fipa::error::ErrorChain;
+use fipa::{Agent, Incoming, MessageBuilder, SenderTasks, log_limit};
 
 /// Sends the answers of an agent, those to each sender in order. A sender that takes no answers delays no other.
 pub(crate) struct Answers<'a> {

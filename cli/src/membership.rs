@@ -9,11 +9,9 @@ use std::time::Duration;
 use clap::Args;
 use fipa::admin::contact;
 use fipa::admin::routes::{self, AskError, RouteReport};
+use fipa::error::{DomainDirError, ErrorChain, ListenError, OpenError, RegisterError};
 use fipa::threads::ThreadError;
-use fipa::{
-    Agent, AgentId, Config, Domain, DomainDirError, Entry, ErrorChain, Incarnation, ListenError,
-    OpenError, Reach, RegisterError, RegisterOptions, Role,
-};
+use fipa::{Agent, AgentId, Config, Domain, Entry, Incarnation, Reach, RegisterOptions, Role};
 use fipa_acl::{escape, escape_name};
 use rustix::process::Signal;
 

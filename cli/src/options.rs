@@ -8,7 +8,8 @@ use clap::{
 };
 use fipa::Config;
 use fipa::config::{ConfigError, Effective, Sources};
-use fipa::{ErrorChain, threads};
+use fipa::error::ErrorChain;
+use fipa::threads;
 use tokio::runtime;
 
 use crate::command::Command;

@@ -6,8 +6,9 @@ use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::process::{self, ExitCode};
 
+use fipa::Performative;
 use fipa::config::{ConfigError, Mistake};
-use fipa::{ErrorChain, Performative};
+use fipa::error::ErrorChain;
 use fipa_acl::is_unprintable;
 use fipa_monitor::near_standard;
 

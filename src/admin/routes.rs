@@ -16,7 +16,8 @@ pub use crate::domain::report::{
     Connected, ContestedName, LinkSecurity, Namesakes, RefusedConnection, RefusedDial, RouteReport,
     StaticPeer,
 };
-use crate::{Agent, Deliveries, Message, ReceiveError, SendError};
+use crate::error::{ReceiveError, SendError};
+use crate::{Agent, Deliveries, Message};
 
 /// The ontology of a request for routes.
 pub const ONTOLOGY: &str = "fipa-mts-routes";

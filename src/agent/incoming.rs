@@ -222,7 +222,7 @@ impl Incoming {
     /// application that acts on messages must not act on such a message.
     ///
     /// ```no_run
-    /// # async fn example(agent: fipa::Agent) -> Result<(), fipa::ReceiveError> {
+    /// # async fn example(agent: fipa::Agent) -> Result<(), fipa::error::ReceiveError> {
     /// loop {
     ///     let incoming = agent.receive().await?;
     ///     if let Some(violation) = incoming.violation() {

@@ -40,7 +40,7 @@ use crate::{AgentId, Config};
 /// and the last agent are dropped.
 ///
 /// A child process that is forked without exec cannot use its parent's membership: calls fail with
-/// [`Forked`](crate::Forked), and dropping releases nothing. The child can open a domain of its own
+/// [`Forked`](crate::error::Forked), and dropping releases nothing. The child can open a domain of its own
 /// on a runtime of its own. Until it ends or calls exec, it keeps its parent's locks, so other
 /// processes detect the end of the parent only afterwards.
 #[derive(Clone)]

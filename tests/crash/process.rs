@@ -122,7 +122,7 @@ pub(crate) fn run(words: &str) {
 async fn gateway(role: &Role, mut queue: Receiver<String>) {
     // A killed gateway holds the lock until its end has been detected.
     let mut opened = Gateway::open(&role.config()).await;
-    while let Err(fipa::OpenError::GatewayRunning(_)) = opened {
+    while let Err(fipa::error::OpenError::GatewayRunning(_)) = opened {
         tokio::time::sleep(Duration::from_millis(20)).await;
         opened = Gateway::open(&role.config()).await;
     }

@@ -81,7 +81,7 @@ async fn increment(worker: &Agent) -> Result<(), Box<dyn std::error::Error>> {
             loop {
                 let answer = worker.receive().await?.into_message();
                 if answer.conversation_id() == Some(&id) {
-                    return Ok::<_, fipa::ReceiveError>(answer);
+                    return Ok::<_, fipa::error::ReceiveError>(answer);
                 }
             }
         };

@@ -21,12 +21,10 @@ mod verdicts;
 
 use std::time::Duration;
 
+use fipa::error::{ErrorChain, OpenError, ReceiveError, SendError};
 use fipa::monitor::ViolationKind;
 use fipa::protocol::{Decision, DialogueError, Reply, Task};
-use fipa::{
-    Agent, AgentId, Config, Domain, ErrorChain, Incoming, Message, MessageBuilder, OpenError,
-    Performative, ReceiveError, SendError,
-};
+use fipa::{Agent, AgentId, Config, Domain, Incoming, Message, MessageBuilder, Performative};
 
 /// Time limit of all calls, which a passing test does not reach.
 const TIMEOUT: Duration = Duration::from_secs(60);

@@ -7,9 +7,9 @@ use std::collections::VecDeque;
 use std::pin::Pin;
 
 use bytes::{Bytes, BytesMut};
+use fipa::error::SendError;
 use fipa::{
     AgentId, Config, Deliveries, Domain, Gateway, Matcher, MessageBuilder, Performative, Query,
-    SendError,
 };
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 use tokio::runtime::{Builder, Runtime};

@@ -170,7 +170,7 @@ pub(super) fn failed(error: &ActionError, robot: &AgentId, config: &Config) -> F
     };
     let problem = match error {
         ActionError::Dialogue(error) => in_full(error),
-        other => fipa::ErrorChain(other).to_string(),
+        other => fipa::error::ErrorChain(other).to_string(),
     };
     Failure::failed(
         problem,

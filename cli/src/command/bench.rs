@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
-use fipa::{AgentId, Config, ErrorChain, Incarnation, RegisterOptions};
+use fipa::error::ErrorChain;
+use fipa::{AgentId, Config, Incarnation, RegisterOptions};
 use fipa_bench::{
     Baseline, BenchError, Changes, Comparison, Effort, Locks, LocksReport, Machine, Measurement,
     Paper, Peers, Program, Selection,

@@ -1,7 +1,8 @@
 //! `fipa coalition`: one shared name for several agents.
 
 use clap::Args;
-use fipa::{AgentId, CoalitionError, Domain, ErrorChain, RegisterOptions};
+use fipa::error::{CoalitionError, ErrorChain};
+use fipa::{AgentId, Domain, RegisterOptions};
 use fipa_acl::escape;
 
 use crate::complete;

@@ -1,7 +1,8 @@
 //! `fipa echo`: an agent that answers.
 
 use clap::Args;
-use fipa::{Agent, Config, ErrorChain, Incoming, Message, MessageBuilder, Performative};
+use fipa::error::ErrorChain;
+use fipa::{Agent, Config, Incoming, Message, MessageBuilder, Performative};
 use fipa_acl::escape_name;
 
 use crate::answers::Answers;

@@ -6,8 +6,8 @@ use std::time::{Duration, SystemTime};
 
 use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, Subcommand};
-use fipa::ErrorChain;
 use fipa::admin::keys::{Certificate, Holding, Keys, KeysError, VALID, Whose};
+use fipa::error::ErrorChain;
 use fipa_acl::escape;
 use serde_json::{Value, json};
 

@@ -1,7 +1,8 @@
 //! `fipa listen`: an agent that prints its letters.
 
 use clap::Args;
-use fipa::{Config, ErrorChain, Incoming};
+use fipa::error::ErrorChain;
+use fipa::{Config, Incoming};
 use fipa_acl::escape_name;
 use fipa_acl::json::message_to_json;
 use serde_json::json;

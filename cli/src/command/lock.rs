@@ -8,8 +8,9 @@ use std::time::Duration;
 
 use clap::Args;
 use fipa::admin::open_files;
+use fipa::error::ErrorChain;
 use fipa::locks::{Lock, LockError};
-use fipa::{Agent, AgentId, Config, ErrorChain, Incarnation, RegisterOptions};
+use fipa::{Agent, AgentId, Config, Incarnation, RegisterOptions};
 use rustix::process::{Pid, Signal, kill_process_group, test_kill_process_group};
 use tokio::process::{Child, Command};
 

@@ -3,8 +3,9 @@
 use std::time::Duration;
 
 use clap::Args;
+use fipa::error::ErrorChain;
 use fipa::locks::ResourceStatus;
-use fipa::{Agent, Config, ErrorChain, Incarnation, RegisterOptions};
+use fipa::{Agent, Config, Incarnation, RegisterOptions};
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
 

@@ -4,13 +4,12 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
+use fipa::error::ErrorChain;
 use fipa::locks::{
     AdmitError, Algorithm, Ending, Fence, LockError, LockOptions, OwnError, OwnOptions,
 };
 use fipa::locks::{Owned, OwnerEvent};
-use fipa::{
-    Agent, AgentId, Config, ErrorChain, Message, MessageBuilder, Performative, RegisterOptions,
-};
+use fipa::{Agent, AgentId, Config, Message, MessageBuilder, Performative, RegisterOptions};
 use fipa_acl::{escape, escape_name};
 
 use crate::answers::Answers;

@@ -3,9 +3,9 @@
 use std::time::{Duration, Instant};
 
 use clap::Args;
+use fipa::error::ErrorChain;
 use fipa::{
-    Agent, AgentId, Config, Deliveries, ErrorChain, Incarnation, Outcome, Performative,
-    RegisterOptions,
+    Agent, AgentId, Config, Deliveries, Incarnation, Outcome, Performative, RegisterOptions,
 };
 use fipa_acl::escape_name;
 use serde_json::json;

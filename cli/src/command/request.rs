@@ -4,10 +4,10 @@ use std::pin::pin;
 use std::time::Duration;
 
 use clap::Args;
+use fipa::error::ErrorChain;
 use fipa::protocol::{DialogueError, Reachability};
 use fipa::{
-    Agent, AgentId, Config, ErrorChain, Incarnation, Message, MessageBuilder, Performative,
-    RegisterOptions,
+    Agent, AgentId, Config, Incarnation, Message, MessageBuilder, Performative, RegisterOptions,
 };
 use fipa_acl::escape_name;
 use fipa_acl::json::message_to_json;

@@ -74,7 +74,7 @@ struct Receivers {
     matcher: Matcher,
 }
 
-fn parse_receivers(text: &str) -> Result<Receivers, fipa::PatternError> {
+fn parse_receivers(text: &str) -> Result<Receivers, fipa::error::PatternError> {
     Ok(Receivers {
         text: text.to_owned(),
         matcher: Matcher::parse(text)?,

@@ -14,9 +14,8 @@ use std::time::Duration;
 
 use fastrand::Rng;
 use fipa::config::Sources;
-use fipa::{
-    Agent, AgentId, Config, Deliveries, Domain, Incoming, Outcome, Performative, RegisterError,
-};
+use fipa::error::RegisterError;
+use fipa::{Agent, AgentId, Config, Deliveries, Domain, Incoming, Outcome, Performative};
 use parking_lot::Mutex;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tokio::sync::oneshot;

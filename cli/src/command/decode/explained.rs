@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use fipa::DecodeError;
+use fipa::error::DecodeError;
 use fipa_acl::{Explanation, Problem, explain};
 use serde_json::{Value, json};
 

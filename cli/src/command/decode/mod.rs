@@ -5,7 +5,8 @@ mod explained;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use fipa::{DecodeError, Letter, Message, Payload};
+use fipa::error::DecodeError;
+use fipa::{Letter, Message, Payload};
 use fipa_acl::Representation;
 use fipa_acl::json::{letter_to_json, message_to_json};
 use serde_json::{Value, json};

@@ -8,11 +8,11 @@ use std::io::Write;
 use std::time::{Duration, Instant};
 
 use fipa::admin::watch::{WatchOptions, Watcher};
+use fipa::error::ErrorChain;
 use fipa::locks::{Fence, Lock, OwnOptions, Owned, with_fences};
 use fipa::monitor::Library;
 use fipa::{
-    Agent, AgentId, Config, Deliveries, Domain, ErrorChain, Gateway, Incoming, Performative, Reach,
-    fnv1a,
+    Agent, AgentId, Config, Deliveries, Domain, Gateway, Incoming, Performative, Reach, fnv1a,
 };
 use serde::{Deserialize, Serialize};
 use serde_json::Value;

@@ -1,9 +1,8 @@
 //! Remedies for messages that were not delivered.
 
+use fipa::error::SendError;
 use fipa::monitor::ViolationKind;
-use fipa::{
-    Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, SendError, is_pattern,
-};
+use fipa::{Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, is_pattern};
 
 use fipa_monitor::one_edit_apart;
 

@@ -10,12 +10,13 @@ use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use clap::Args;
+use fipa::error::ErrorChain;
 use fipa::locks::{Fence, with_fences};
 use fipa::monitor::History;
 use fipa::protocol::{PartnerEvent, PartnerWatch};
 use fipa::{
-    Agent, AgentId, Config, Deliveries, DeliveryFailure, ErrorChain, Incarnation, Incoming,
-    Message, Performative, RegisterOptions, Time,
+    Agent, AgentId, Config, Deliveries, DeliveryFailure, Incarnation, Incoming, Message,
+    Performative, RegisterOptions, Time,
 };
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};
@@ -270,7 +271,7 @@ async fn register(
     Ok(agent)
 }
 
-fn not_sent(error: &fipa::SendError) -> Failure {
+fn not_sent(error: &fipa::error::SendError) -> Failure {
     Failure::failed(
         format!("cannot send the message: {}", ErrorChain(error)),
         "this process",

@@ -2,7 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use fipa::{Agent, Config, Deliveries, SendError};
+use fipa::error::SendError;
+use fipa::{Agent, Config, Deliveries};
 use serde_json::json;
 use tokio::task::{JoinError, JoinSet};
 use tokio::time::Interval;

@@ -2,7 +2,8 @@
 
 use std::time::Instant;
 
-use fipa::{Agent, AgentId, ErrorChain, Incoming, Message, Performative};
+use fipa::error::ErrorChain;
+use fipa::{Agent, AgentId, Incoming, Message, Performative};
 use fipa_acl::escape_name;
 use fipa_acl::json::message_to_json;
 use serde_json::{Value, json};

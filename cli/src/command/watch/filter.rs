@@ -23,7 +23,7 @@ pub(super) struct Conversation {
     pattern: Matcher,
 }
 
-pub(super) fn conversation(text: &str) -> Result<Conversation, fipa::PatternError> {
+pub(super) fn conversation(text: &str) -> Result<Conversation, fipa::error::PatternError> {
     let exact = || Matcher::Exact(text.to_owned());
     Ok(Conversation {
         id: text.to_owned(),
