@@ -8,6 +8,7 @@ use fipa_acl::Message;
 use fipa_locking::{Algorithm, Options, codec};
 use parking_lot::Mutex;
 
+use crate::agent::AgentCore;
 use crate::agent::incoming::Incoming;
 
 /// Protocol of questions to owners about their resources.
@@ -30,15 +31,11 @@ fn is_lock_protocol(name: &str) -> bool {
 
 /// The agents of this membership whose locks run. They know each other without letters.
 #[derive(Default)]
-pub(crate) struct Neighbors(Mutex<Vec<Weak<dyn Any + Send + Sync>>>);
+pub(crate) struct Neighbors(Mutex<Vec<Weak<AgentCore>>>);
 
 impl Neighbors {
-    /// Adds an agent, and returns those that were added before it and have not ended. Their type is that of the
-    /// module `agent`.
-    pub(crate) fn add(
-        &self,
-        agent: Weak<dyn Any + Send + Sync>,
-    ) -> Vec<Arc<dyn Any + Send + Sync>> {
+    /// Adds an agent, and returns those that were added before it and have not ended.
+    pub(crate) fn add(&self, agent: Weak<AgentCore>) -> Vec<Arc<AgentCore>> {
         let mut agents = self.0.lock();
         agents.retain(|agent| agent.strong_count() > 0);
         let before = agents.iter().filter_map(Weak::upgrade).collect();
@@ -57,28 +54,26 @@ pub(crate) struct Slot {
     pub(crate) options: Option<(Algorithm, Options)>,
     /// Whether legacy peers are asked whether they use locks.
     pub(crate) legacy_peers: bool,
-    pub(crate) running: Option<Running>,
+    pub(crate) running: Option<Arc<dyn RunningLocks>>,
     pub(crate) is_closed: bool,
 }
 
-/// Running locks.
-pub(crate) struct Running {
-    /// The state, whose type is that of the module `locks`.
-    pub(crate) shared: Arc<dyn Any + Send + Sync>,
-    /// Releases all locks.
-    pub(crate) close: Box<dyn FnOnce() + Send>,
+/// The running locks of an agent. The module `locks` has the only implementation, and reads its own type back.
+pub(crate) trait RunningLocks: Any + Send + Sync {
+    /// Releases all locks and ends all ownership of the agent.
+    fn close(&self, agent: &AgentCore);
 }
 
 impl LockSlot {
     /// Ends the locks, before the agent is deregistered.
-    pub(crate) fn close(&self) {
+    pub(crate) fn close(&self, agent: &AgentCore) {
         let running = {
             let mut slot = self.0.lock();
             slot.is_closed = true;
             slot.running.take()
         };
         if let Some(running) = running {
-            (running.close)();
+            running.close(agent);
         }
     }
 }

@@ -400,7 +400,7 @@ impl Agent {
             let name = Arc::clone(&self.core.endpoint.name);
             return Err(DeregisterError::NotRegistered(name));
         }
-        self.core.locks.close();
+        self.core.locks.close(&self.core);
         let unread = self.core.endpoint.deregister()?;
         let mut all = self.core.demultiplexer.drain();
         let unread = unread.into_iter();
@@ -428,7 +428,7 @@ impl Drop for RegistrationGuard {
         let is_over = *self.is_over.get_mut();
         // In a forked child, the agent stays registered for the parent.
         if !is_over && self.core.endpoint.domain.inner.owner.is_this() {
-            self.core.locks.close();
+            self.core.locks.close(&self.core);
             match self.core.endpoint.deregister() {
                 // Closing the domain has already removed the name.
                 Ok(_) | Err(DeregisterError::Closed) => {}

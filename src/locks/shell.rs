@@ -29,7 +29,7 @@ use crate::DirectoryView;
 use crate::agent::AgentCore;
 use crate::agent::demultiplexer::ReaderKey;
 use crate::agent::incoming::Incoming;
-use crate::agent::lock_slot::{self, Running, Slot};
+use crate::agent::lock_slot::{self, RunningLocks, Slot};
 use crate::domain::background;
 use crate::protocol::{PartnerEvent, PartnerWatch};
 
@@ -68,8 +68,8 @@ pub(super) fn started(core: &AgentCore) -> Option<Arc<Shared>> {
 }
 
 fn shared(slot: &Slot) -> Option<Arc<Shared>> {
-    let shared = Arc::clone(&slot.running.as_ref()?.shared);
-    shared.downcast().ok()
+    let running: Arc<dyn Any + Send + Sync> = Arc::clone(slot.running.as_ref()?) as _;
+    running.downcast().ok()
 }
 
 /// Returns the running locks of an agent. The first call starts them.
@@ -108,15 +108,7 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
         changed: Notify::new(),
         kind,
     });
-    let (ending, agent) = (Arc::clone(&shared), Arc::downgrade(core));
-    slot.running = Some(Running {
-        shared: Arc::clone(&shared) as Arc<dyn Any + Send + Sync>,
-        close: Box::new(move || {
-            if let Some(agent) = agent.upgrade() {
-                ending.close(&agent);
-            }
-        }),
-    });
+    slot.running = Some(Arc::clone(&shared) as Arc<dyn RunningLocks>);
     drop(slot);
     meet_neighbors(core, &me, &shared);
     let task = Task {
@@ -139,9 +131,6 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
 fn meet_neighbors(core: &Arc<AgentCore>, me: &LockPeer, shared: &Shared) {
     let this = Arc::downgrade(core);
     for other in core.endpoint.domain.inner.locking.add(this) {
-        let Ok(other) = other.downcast::<AgentCore>() else {
-            continue;
-        };
         let Some(of_other) = started(&other) else {
             continue;
         };
@@ -572,8 +561,9 @@ impl Shared {
             notified.await;
         }
     }
+}
 
-    /// Releases all claims and ends all ownership.
+impl RunningLocks for Shared {
     fn close(&self, core: &AgentCore) {
         self.act(core, |state, now, actions| {
             state.is_closed = true;
