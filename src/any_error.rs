@@ -26,7 +26,7 @@ use crate::domain::files::DomainDirError;
 #[cfg(feature = "protocols")]
 use crate::error::ProtocolError;
 use crate::error::{OpenError, ReceiveError, SendError};
-#[cfg(feature = "locks")]
+#[cfg(feature = "protocols")]
 use crate::locks::{AdmitError, LockError, OwnError, StateFileError};
 #[cfg(feature = "protocols")]
 use crate::platform::PlatformError;
@@ -128,19 +128,19 @@ pub enum Error {
     #[error(transparent)]
     Platform(#[from] PlatformError),
     /// A lock cannot be acquired or was lost.
-    #[cfg(feature = "locks")]
+    #[cfg(feature = "protocols")]
     #[error(transparent)]
     Lock(#[from] LockError),
     /// A resource cannot be owned.
-    #[cfg(feature = "locks")]
+    #[cfg(feature = "protocols")]
     #[error(transparent)]
     Own(#[from] OwnError),
     /// The state file of an owner cannot be used.
-    #[cfg(feature = "locks")]
+    #[cfg(feature = "protocols")]
     #[error(transparent)]
     StateFile(#[from] StateFileError),
     /// An owner refuses the fence of a message.
-    #[cfg(feature = "locks")]
+    #[cfg(feature = "protocols")]
     #[error(transparent)]
     Admit(#[from] AdmitError),
     /// A goal was not reached.

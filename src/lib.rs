@@ -59,7 +59,7 @@
 //! [`Agent::subscribe`] notify many agents. `monitor.check = "enforce"` checks all messages of a process
 //! against the protocols.
 //!
-//! [`Agent::own`] and [`Agent::lock`] (feature `locks`) reserve resources that agents share ([`locks`]).
+//! [`Agent::own`] and [`Agent::lock`] reserve resources that agents share ([`locks`]).
 //!
 //! [`Agent::offer`] (feature `actions`) offers an action of a robot, and [`Agent::robot`] lists and invokes
 //! those of another ([`actions`]).
@@ -96,10 +96,6 @@
     not(feature = "net"),
     doc = "[`Gateway`]: https://docs.rs/fipa/latest/fipa/struct.Gateway.html"
 )]
-#![cfg_attr(
-    not(feature = "locks"),
-    doc = "[`locks`]: https://docs.rs/fipa/latest/fipa/locks/index.html"
-)]
 
 mod access;
 #[cfg(feature = "actions")]
@@ -116,7 +112,7 @@ pub mod error;
 pub mod fuzzing;
 #[cfg(feature = "net")]
 mod gateway;
-#[cfg(feature = "locks")]
+#[cfg(feature = "protocols")]
 pub mod locks;
 #[cfg(feature = "protocols")]
 pub mod platform;

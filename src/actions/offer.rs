@@ -122,7 +122,7 @@ impl Action {
     /// # Ok(())
     /// # }
     /// ```
-    #[cfg(feature = "locks")]
+    #[cfg(feature = "protocols")]
     pub fn fenced_by(self, mut admission: crate::locks::Admission) -> Self {
         self.fenced(move |text| {
             let fence = text.parse::<crate::locks::Fence>();

@@ -198,7 +198,7 @@ impl Incoming {
     }
 
     /// Returns the protocol without a view of the other parameters.
-    #[cfg(feature = "locks")]
+    #[cfg(feature = "protocols")]
     pub(crate) fn protocol(&self) -> Option<Text<'_>> {
         self.parts.index.protocol(self.parts.letter.payload())
     }

@@ -2,26 +2,19 @@
 
 #[cfg(feature = "protocols")]
 pub(crate) mod checks;
-#[cfg(not(feature = "protocols"))]
-#[path = "checks_disabled.rs"]
-pub(crate) mod checks;
 pub(crate) mod delivery;
 #[cfg(feature = "protocols")]
 pub(crate) mod delivery_report;
 #[cfg(feature = "protocols")]
 pub(crate) mod demultiplexer;
-#[cfg(not(feature = "protocols"))]
-#[path = "demultiplexer_disabled.rs"]
-pub(crate) mod demultiplexer;
 pub(crate) mod endpoint;
 pub(crate) mod incoming;
-#[cfg(feature = "locks")]
-pub(crate) mod lock_slot;
-#[cfg(not(feature = "locks"))]
-#[path = "lock_slot_disabled.rs"]
+#[cfg(feature = "protocols")]
 pub(crate) mod lock_slot;
 pub(crate) mod sender_tasks;
 pub(crate) mod stated;
+#[cfg(not(feature = "protocols"))]
+pub(crate) mod without_protocols;
 
 use std::fmt;
 use std::sync::Arc;
@@ -35,6 +28,10 @@ use fipa_mts::LetterDraft;
 use fipa_sds::{Cancellation, DeregisterError, RegisterError, Registration};
 use fipa_transport::{Incarnation, LoanedContent, log_limit};
 
+#[cfg(not(feature = "protocols"))]
+pub(crate) use self::without_protocols::{
+    self as checks, self as demultiplexer, self as lock_slot,
+};
 use crate::agent::delivery::{Deliveries, deliveries};
 use crate::agent::demultiplexer::Demultiplexer;
 use crate::agent::endpoint::Endpoint;

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use fipa_sds::{Cancellation, RegisterError};
 use fipa_transport::threads::{self, ThreadError};
-#[cfg(any(feature = "net", feature = "locks"))]
+#[cfg(any(feature = "net", feature = "protocols"))]
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
@@ -92,7 +92,7 @@ pub(crate) async fn try_run<T: Send + 'static>(
 
 /// Runs `work` on a thread of its own, within the context of the runtime, and returns its end. If the system
 /// refuses another thread, the work has ended on the calling one, because it must not be left out.
-#[cfg(any(feature = "net", feature = "locks"))]
+#[cfg(any(feature = "net", feature = "protocols"))]
 pub(crate) fn finish<W: FnOnce() + Send + 'static>(
     runtime: &Handle,
     work: W,
@@ -114,7 +114,7 @@ pub(crate) fn finish<W: FnOnce() + Send + 'static>(
     }
 }
 
-#[cfg(any(feature = "net", feature = "locks"))]
+#[cfg(any(feature = "net", feature = "protocols"))]
 fn run_once(work: &Mutex<Option<impl FnOnce()>>) {
     let work = work.lock().take();
     if let Some(work) = work {

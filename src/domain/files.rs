@@ -272,7 +272,7 @@ impl DomainDir {
     }
 
     /// Returns the name of the domain.
-    #[cfg(feature = "locks")]
+    #[cfg(feature = "protocols")]
     pub(crate) fn name(&self) -> &str {
         &self.domain
     }

@@ -56,7 +56,7 @@ pub(crate) struct Inner {
     pub(crate) max_letter: u64,
     pub(crate) rules: Rules,
     #[cfg_attr(
-        not(feature = "locks"),
+        not(feature = "protocols"),
         expect(dead_code, reason = "there are no locks")
     )]
     pub(crate) locking: lock_slot::Neighbors,

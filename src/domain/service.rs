@@ -189,7 +189,7 @@ impl Service {
     }
 
     /// Returns the name of the domain.
-    #[cfg(feature = "locks")]
+    #[cfg(feature = "protocols")]
     pub(crate) fn domain_name(&self) -> &str {
         self.dir.name()
     }

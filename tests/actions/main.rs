@@ -501,7 +501,7 @@ async fn access_rules_can_name_actions() {
     assert_eq!(runs.load(Ordering::Relaxed), 3);
 }
 
-#[cfg(feature = "locks")]
+#[cfg(feature = "protocols")]
 #[tokio::test(flavor = "multi_thread")]
 async fn a_goal_runs_only_with_the_fence_of_the_live_lock() {
     use fipa::locks::{Admission, OwnOptions};
