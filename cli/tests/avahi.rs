@@ -45,7 +45,11 @@ fn agents_come_and_go(avahi: &Avahi<'_>) {
         "--set",
         "discovery.mdns=true",
         "--set",
+        "mts.transports=[\"shm\", \"unix\", \"tcp\", \"udt\"]",
+        "--set",
         "transport.tcp.listen=[\"10.99.0.1:0\"]",
+        "--set",
+        "transport.udt.listen=[\"10.99.0.1:0\"]",
         "--set",
         "security.insecure=true",
         "--set",
@@ -156,14 +160,18 @@ fn ends(running: Running) {
     assert_eq!(running.signal("-INT"), (Some(0), String::new()));
 }
 
-/// The expected value of the key `LOCATOR`.
+/// The expected value of the key `LOCATOR`: the locations that legacy peers can use.
 fn locator(gateway: &Running) -> String {
     let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
     let locations = ready["locations"].as_array().unwrap();
-    let mut locations = locations.iter().filter_map(Value::as_str);
-    let location = locations.find(|one| one.starts_with("tcp://10.99.0.1:"));
-    let address = location.unwrap().split('#').next().unwrap();
-    format!("{address} fipa::services::transports::MessageTransport;")
+    let locations: Vec<&str> = locations.iter().filter_map(Value::as_str).collect();
+    let of_kind = |kind: &str| {
+        let start = format!("{kind}://10.99.0.1:");
+        let location = locations.iter().find(|one| one.starts_with(&start));
+        let address = location.unwrap().split(['#', ';']).next().unwrap();
+        format!("{address} fipa::services::transports::MessageTransport;")
+    };
+    of_kind("tcp") + &of_kind("udt")
 }
 
 /// The registration time of an agent in the format of legacy peers.

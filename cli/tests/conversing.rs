@@ -415,7 +415,7 @@ fn a_message_is_sent_at_a_rate() {
         "{printed}"
     );
     assert!(
-        printed.contains(": 0 outcomes delivered, 2 failed\n"),
+        printed.contains(": 0 outcomes delivered, 0 sent without a confirmation, 2 failed\n"),
         "{printed}"
     );
     assert!(

@@ -231,6 +231,17 @@ impl Service {
         best(framed.cloned().collect())
     }
 
+    /// Returns the locations that other hosts may learn: those for directories, and the UDT ones, by which only legacy
+    /// peers reach an agent.
+    #[cfg(feature = "net")]
+    pub(crate) fn announced_locations(&self) -> Vec<Location> {
+        let locations = self.locations.borrow();
+        let announced = locations.iter().filter(|location| {
+            location.signature() == Signature::Frames || location.kind() == Kind::Udt
+        });
+        best(announced.cloned().collect())
+    }
+
     /// Returns a receiver that is notified of changes of the locations.
     #[cfg(feature = "net")]
     pub(crate) fn follow_locations(&self) -> watch::Receiver<Arc<[Location]>> {

@@ -43,7 +43,7 @@ impl Publisher {
     /// Returns the locations that other hosts can use. A loopback address is none of them, because
     /// on another host it leads to that host.
     fn announced_locations(&self) -> Vec<Location> {
-        let mut locations = self.service.locations();
+        let mut locations = self.service.announced_locations();
         locations.retain(|location| {
             let stays_here = location.kind().is_host_local();
             !stays_here && (self.only_loopback || !is_on_loopback(location.address()))

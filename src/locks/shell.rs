@@ -267,8 +267,9 @@ impl State {
                 algorithm,
             } => log_limit::warn!(
                 of: resource.as_str(), resource = %escape(resource.as_str()), by = %escape_name(by.name()), %algorithm,
-                "refused an agent that uses another algorithm for a resource that this agent owns; for agents of \
-                 distributed_locking, own the resource with `legacy_peers`"
+                own = %self.core.kind(),
+                "refused an agent that uses another algorithm than that of this owner; agents of distributed_locking \
+                 need the algorithm with which the owner was started, and an owner with `legacy_peers`"
             ),
             Event::Granted { resource, grant } => {
                 self.notify(&resource, OwnerEvent::granted(grant));

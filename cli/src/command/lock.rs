@@ -145,9 +145,14 @@ async fn acquire(agent: &Agent, arguments: &Arguments) -> Result<Lock, Failure> 
         };
         let help = match error {
             LockError::NoOwner { .. } | LockError::OwnerNotFound { .. } => {
-                "start the owner, for example `fipa own RESOURCE`"
+                "start the owner, for example `fipa own RESOURCE`; an owner of the C++ library distributed_locking \
+                 needs --legacy-peers here"
             }
             LockError::OtherAlgorithm { .. } => "leave --algorithm out, or name that of the owner",
+            LockError::TimedOut { .. } if arguments.group.legacy_peers() => {
+                "`fipa locks` shows the owner, the holder and the waiting agents; an owner of the C++ library \
+                 distributed_locking answers only its own algorithm, so name that with --algorithm"
+            }
             LockError::Name(_) => "use a name of 1 to 255 bytes without control characters",
             _ => "`fipa locks` shows the owner, the holder and the waiting agents",
         };

@@ -98,6 +98,10 @@ fn algorithm(text: &str) -> Result<Algorithm, String> {
 }
 
 impl Group {
+    pub(super) fn legacy_peers(&self) -> bool {
+        self.legacy_peers
+    }
+
     pub(super) fn apply(&self, agent: &Agent) -> Result<(), LockError> {
         agent.use_locks(LockOptions {
             algorithm: self.algorithm,

@@ -99,7 +99,10 @@ pub(super) fn encode(entry: &Entry) -> Properties {
     }
     own("fipa-time", &time.to_string());
     let locations = entry.locations.iter();
-    let locations = locations.filter(|location| !location.kind().is_host_local());
+    // Services that confirm deliveries must not use a location for legacy peers only.
+    let locations = locations.filter(|location| {
+        !location.kind().is_host_local() && location.signature() == Signature::Frames
+    });
     let mut locations: Vec<String> = locations
         .map(|location| location.clone().without_scope().to_string())
         .collect();
@@ -564,6 +567,12 @@ mod tests {
             locator,
             format!("udt://10.0.0.2:6790 {SIGNATURE};").as_bytes()
         );
+        // Services of this project do not use it.
+        let (_, own) = properties
+            .iter()
+            .find(|(key, _)| key == "fipa-locations")
+            .unwrap();
+        assert_eq!(own, b"");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use fipa::error::SendError;
-use fipa::{Agent, Config, Deliveries};
+use fipa::{Agent, Config, Deliveries, Outcome};
 use serde_json::json;
 use tokio::task::{JoinError, JoinSet};
 use tokio::time::Interval;
@@ -60,14 +60,15 @@ pub(super) async fn send(
     let Tally {
         messages,
         delivered,
+        sent,
         failed,
     } = tally;
     match arguments.json {
         true => output::json_line(&json!({
-            "messages": messages, "delivered": delivered, "failed": failed, "seconds": seconds,
+            "messages": messages, "delivered": delivered, "sent": sent, "failed": failed, "seconds": seconds,
         }))?,
         false => output::text(&format!(
-            "{messages} messages in {seconds:.1} s: {delivered} outcomes delivered, {failed} failed\n"
+            "{messages} messages in {seconds:.1} s: {delivered} outcomes delivered, {sent} sent without a confirmation, {failed} failed\n"
         ))?,
     }
     Failure::all((failed > 0).then(|| {
@@ -127,6 +128,8 @@ async fn tick(starts: &mut Option<Interval>) {
 struct Tally {
     messages: u64,
     delivered: u64,
+    /// Number of outcomes of legacy peers, which confirm nothing.
+    sent: u64,
     failed: u64,
 }
 
@@ -143,9 +146,10 @@ impl Tally {
             output::json_line(&json!({ "number": number, "deliveries": deliveries }))?;
         }
         for delivery in deliveries.0 {
-            match delivery.outcome.is_success() {
-                true => self.delivered += 1,
-                false => {
+            match delivery.outcome {
+                Outcome::Delivered { .. } => self.delivered += 1,
+                Outcome::Sent { .. } => self.sent += 1,
+                _ => {
                     self.failed += 1;
                     if !json {
                         let one = Deliveries(vec![delivery]);
