@@ -132,7 +132,7 @@ async fn each_letter_yields_one_event_with_its_outcome() {
     rover.send(request(&rover, "arm_.*", "all")).await.unwrap();
     let (one, two) = (letter(&mut watcher).await, letter(&mut watcher).await);
     assert_ne!(one.receiver, two.receiver);
-    assert!(one.send.is_some() && one.send == two.send);
+    assert!(one.submission.is_some() && one.submission == two.submission);
 
     // A letter that fails, and the failure message to its sender.
     rover

@@ -35,7 +35,7 @@ pub struct ActionLimits {
     /// clients together have eight times as much.
     pub bytes_of_client: usize,
     /// Time for which an ended goal is stored, in milliseconds.
-    pub kept: u64,
+    pub retention: u64,
     /// Minimum time between two reports of progress of a goal, in milliseconds.
     pub progress_interval: u64,
     /// Time for a handler to stop, in milliseconds. Then it is ended.
@@ -50,7 +50,7 @@ impl Default for ActionLimits {
             ended: 1_024,
             ended_of_client: 128,
             bytes_of_client: 1 << 20,
-            kept: 600_000,
+            retention: 600_000,
             progress_interval: 100,
             grace: 5_000,
         }
@@ -774,7 +774,7 @@ impl Executor {
             return;
         };
         let conversations = std::mem::take(&mut record.conversations);
-        let told = conversations.len();
+        let count = conversations.len();
         for conversation in conversations {
             self.conversations.remove(&conversation);
             let outcome = outcome.clone();
@@ -793,7 +793,7 @@ impl Executor {
         };
         let client = self.clients.entry(Arc::clone(&record.client)).or_default();
         client.open = client.open.saturating_sub(1);
-        client.conversations = client.conversations.saturating_sub(told);
+        client.conversations = client.conversations.saturating_sub(count);
         client.bytes -= waited;
         client.waiting -= waited;
         self.bytes -= waited;
@@ -813,7 +813,7 @@ impl Executor {
         self.set_timer(
             goal,
             Timer::Forget,
-            Some(now.saturating_add(self.limits.kept)),
+            Some(now.saturating_add(self.limits.retention)),
         );
         self.shrink(&name);
     }

@@ -155,7 +155,7 @@ impl<'de> Deserializer<'de> for Probe<'_> {
         self.set(Type::Any)?;
         let mut ignored = Found::default();
         visitor.visit_seq(Elements {
-            left: len,
+            remaining: len,
             is_first: true,
             found: &mut ignored,
             state: self.state,
@@ -223,7 +223,7 @@ impl<'p> Probe<'p> {
         self.set(Type::Any)?;
         let mut element = Found::default();
         let value = visitor.visit_seq(Elements {
-            left: len.min(MAX_PARTS),
+            remaining: len.min(MAX_PARTS),
             is_first: true,
             found: &mut element,
             state: self.state,
@@ -236,7 +236,7 @@ impl<'p> Probe<'p> {
 
 /// The elements of a sequence. Their type is that of all elements, or `any`.
 struct Elements<'p> {
-    left: usize,
+    remaining: usize,
     is_first: bool,
     found: &'p mut Found,
     state: &'p RefCell<State>,
@@ -249,10 +249,10 @@ impl<'de> SeqAccess<'de> for Elements<'_> {
         &mut self,
         seed: T,
     ) -> Result<Option<T::Value>, Error> {
-        let Some(left) = self.left.checked_sub(1) else {
+        let Some(remaining) = self.remaining.checked_sub(1) else {
             return Ok(None);
         };
-        self.left = left;
+        self.remaining = remaining;
         let mut found = Found::default();
         let value = seed.deserialize(Probe {
             found: &mut found,

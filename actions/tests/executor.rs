@@ -176,12 +176,12 @@ fn a_goal_that_is_sent_again_runs_once() {
     executor.request(4, 5, "arm", "a", goal("")).unwrap();
     started(&mut executor);
     // The outcome is stored for a while.
-    let kept = ActionLimits::default().kept;
-    executor.handle_timeout(3 + kept);
-    executor.ended(3 + kept, number + 1, Ok(None));
+    let retention = ActionLimits::default().retention;
+    executor.handle_timeout(3 + retention);
+    executor.ended(3 + retention, number + 1, Ok(None));
     outputs(&mut executor);
     executor
-        .request(4 + kept, 6, "rover", "a", goal(""))
+        .request(4 + retention, 6, "rover", "a", goal(""))
         .unwrap();
     started(&mut executor);
 }

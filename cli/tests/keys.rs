@@ -474,8 +474,8 @@ fn a_named_pipe_among_the_certificates_does_not_block() {
     let trusted = rover.host.path("keys/trusted");
     std::fs::create_dir_all(&trusted).unwrap();
     let pipe = trusted.join("other.pem").display().to_string();
-    let made = Command::new("mkfifo").args(["-m", "600", &pipe]).status();
-    assert!(made.unwrap().success());
+    let status = Command::new("mkfifo").args(["-m", "600", &pipe]).status();
+    assert!(status.unwrap().success());
     let listed = rover.host.run(&["keys", "list", "--dir", &rover.dir()]);
     let output = format!(
         "{}{}",

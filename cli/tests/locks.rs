@@ -246,9 +246,9 @@ fn the_command_is_ended_when_the_lock_is_lost() {
 
     let crane = own(&host, &["--lease", "1s"]);
     let script = "echo $FIPA_FENCE $$; while [ ! -e go ]; do sleep 0.1; done; exit 3";
-    let (mut kept, _, _process) = hold(&host, &["--keep"], script);
+    let (mut holder, _, _process) = hold(&host, &["--keep"], script);
     crane.signal("-KILL");
-    kept.wait_for_log(&["warning:", "the lock of \"bay\" was lost"]);
+    holder.wait_for_log(&["warning:", "the lock of \"bay\" was lost"]);
     fs::write(host.path("go"), "").unwrap();
-    assert_eq!(kept.end().0, Some(3));
+    assert_eq!(holder.end().0, Some(3));
 }

@@ -213,9 +213,9 @@ on_a_network!(commands_show_where_a_gateway_is_now, |family| {
     let now = robots[1].gateway_has(&after);
     assert!(!now.contains(&before), "{now}");
     let report = robots[1].fipa(host, &["routes", "--json"]);
-    let told = report["gateway"]["locations"].to_string();
-    assert!(told.contains(&format!("tcp://{after}")), "{report}");
-    assert!(!told.contains(&before), "{report}");
+    let output_text = report["gateway"]["locations"].to_string();
+    assert!(output_text.contains(&format!("tcp://{after}")), "{report}");
+    assert!(!output_text.contains(&before), "{report}");
     let report = robots[1].fipa(host, &["doctor", "--json"]);
     let checks = report["checks"].as_array().unwrap();
     let listens = checks.iter().find(|it| it["check"] == "locations").unwrap();
@@ -464,8 +464,9 @@ impl Robot {
             command.args(["--set", setting]);
         }
         let output = command.output().unwrap();
-        let told = String::from_utf8_lossy(&output.stderr);
-        serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {told}"))
+        let output_text = String::from_utf8_lossy(&output.stderr);
+        serde_json::from_slice(&output.stdout)
+            .unwrap_or_else(|error| panic!("{error}: {output_text}"))
     }
 }
 

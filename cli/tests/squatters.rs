@@ -92,9 +92,9 @@ fn names_that_another_user_has_created_stop_no_process() {
     let page = names.find(|name| name.contains(&host.domain) && name.ends_with(".page"));
     let page = page.unwrap();
     let prefix = page.rsplit_once('_').unwrap().0;
-    let made =
+    let created =
         ["x.global_mgmt", "0123456789abcdef.page"].map(|end| format!("/dev/shm/{prefix}_{end}"));
-    for file in &made {
+    for file in &created {
         fs::write(file, "").unwrap();
         fs::set_permissions(file, Permissions::from_mode(0o600)).unwrap();
     }
@@ -106,7 +106,7 @@ fn names_that_another_user_has_created_stop_no_process() {
     assert!(report.contains("user root (0) holds that name"), "{report}");
 
     drop(arm);
-    for file in &made {
+    for file in &created {
         fs::remove_file(file).unwrap();
     }
 }

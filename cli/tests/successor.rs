@@ -281,10 +281,14 @@ impl<'a> Jade<'a> {
     /// Waits for a notification that has this text.
     fn is_told(&self, text: &str) {
         loop {
-            let told = self.next();
-            assert_eq!(*told.performative(), Performative::Inform, "{told}");
-            assert_eq!(told.conversation_id(), Some("c-subscribe"));
-            let content = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+            let notification = self.next();
+            assert_eq!(
+                *notification.performative(),
+                Performative::Inform,
+                "{notification}"
+            );
+            assert_eq!(notification.conversation_id(), Some("c-subscribe"));
+            let content = String::from_utf8(notification.content().unwrap().to_vec()).unwrap();
             if content.contains(text) {
                 return;
             }
@@ -369,7 +373,7 @@ fn a_successor_has_what_agents_told(family: Family) {
     });
     let before = pair.all();
     assert!(before.iter().all(Option::is_some), "{before:#?}");
-    kept(0, "painter@jade");
+    wait_for_state(0, "painter@jade");
     for at in [0, 1, 0] {
         let killed = Instant::now();
         pair.replace(at, || {});
@@ -389,7 +393,7 @@ fn a_successor_has_what_agents_told(family: Family) {
     let late = pair.agent(0, "df register late painting");
     jade.is_told("late");
     assert_eq!(line_about(&mut watched, "late")["event"], "changed");
-    kept(0, "late");
+    wait_for_state(0, "late");
     pair.replace(0, || drop(late));
     jade.is_told("late");
     assert_eq!(line_about(&mut watched, "late")["event"], "left");
@@ -400,10 +404,10 @@ fn a_successor_has_what_agents_told(family: Family) {
 }
 
 /// Waits until the file of the gateway has this text.
-fn kept(at: usize, text: &str) {
+fn wait_for_state(at: usize, text: &str) {
     let runtime = std::env::var_os("FIPA_RUNTIME_DIR").unwrap();
     let file = std::path::Path::new(&runtime).join(format!("host{at}/gateway.state"));
     until("the gateway keeps its state", || {
-        std::fs::read_to_string(&file).is_ok_and(|kept| kept.contains(text))
+        std::fs::read_to_string(&file).is_ok_and(|wait_for_state| wait_for_state.contains(text))
     });
 }

@@ -450,10 +450,10 @@ impl World {
             deadline,
         };
         let honest = [ARM, ROVER].contains(&receiver);
-        let (send, count) = self.service(at).core.submit(now, submission);
+        let (submission, count) = self.service(at).core.submit(now, submission);
         // The view does not change, so a refresh adds nothing.
         assert!(count.is_none_or(|count| count == 1));
-        self.sends.insert((at, send), number);
+        self.sends.insert((at, submission), number);
         self.sent.push(Sent {
             sender,
             receiver,
@@ -692,7 +692,9 @@ impl World {
         let which = input.below(self.introduced.len().min(256));
         let (at, introduction) = self.introduced.swap_remove(which);
         let now = self.clocks();
-        self.service(at).core.handle_parted(now, &introduction);
+        self.service(at)
+            .core
+            .handle_disconnected(now, &introduction);
         self.carry_out(at);
     }
 
@@ -790,8 +792,12 @@ impl World {
                         self.coming.push_back((self.now + DELAY, to, coming));
                     }
                 }
-                Action::Outcome { send, outcome, .. } => {
-                    if let Some(number) = self.sends.get(&(at, send)) {
+                Action::Outcome {
+                    submission,
+                    outcome,
+                    ..
+                } => {
+                    if let Some(number) = self.sends.get(&(at, submission)) {
                         let sent = &mut self.sent[*number as usize];
                         assert!(sent.outcome.is_none(), "a second outcome: {outcome:?}");
                         sent.outcome = Some(outcome);
@@ -804,8 +810,8 @@ impl World {
                     self.service(at).core.handle_refreshed(now, number);
                 }
                 Action::Resolved { outcomes, .. } => assert_eq!(outcomes, 1),
-                Action::Heard { .. }
-                | Action::HeardAgain { .. }
+                Action::ContactSeen { .. }
+                | Action::ContactSeenAgain { .. }
                 | Action::Taken { .. }
                 | Action::Suspect { .. }
                 | Action::Notice(_) => {}

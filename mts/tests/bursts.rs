@@ -424,8 +424,12 @@ impl Path {
                     let (from, attempt) = self.services[at].tickets.remove(&ticket).unwrap();
                     self.conclude((at, from), attempt, Conclusion::Answered(answer));
                 }
-                Action::Outcome { send, outcome, .. } => {
-                    self.outcomes.push((send, self.now, outcome));
+                Action::Outcome {
+                    submission,
+                    outcome,
+                    ..
+                } => {
+                    self.outcomes.push((submission, self.now, outcome));
                 }
                 Action::Deliverable { agent } => self.read(agent),
                 Action::Refresh { number } => {
@@ -450,8 +454,8 @@ impl Path {
         }
         let stream = usize::try_from(agent.as_u64() - 10).unwrap();
         assert!(self.services[RECEIVER].core.take(agent).is_some());
-        let send = self.queues[stream].pop_front().unwrap();
-        self.taken.insert(send, self.now);
+        let submission = self.queues[stream].pop_front().unwrap();
+        self.taken.insert(submission, self.now);
         let (last, longest) = &mut self.gaps[stream];
         let gap = last.map_or(Duration::ZERO, |last| self.now - last);
         *longest = gap.max(*longest);
@@ -461,8 +465,8 @@ impl Path {
     /// The longest time from the taking of a letter to its outcome.
     fn slowest_outcome(&self) -> Duration {
         let mut slowest = Duration::ZERO;
-        for (send, ended, outcome) in &self.outcomes {
-            let Some(taken) = self.taken.get(send) else {
+        for (submission, ended, outcome) in &self.outcomes {
+            let Some(taken) = self.taken.get(submission) else {
                 assert!(
                     matches!(
                         outcome,

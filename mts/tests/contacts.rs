@@ -44,11 +44,11 @@ struct Publishing {
 }
 
 impl Contacts for Publishing {
-    fn heard(&self, name: &str, _: Incarnation, _: Location, _: Option<&str>) {
+    fn contact_seen(&self, name: &str, _: Incarnation, _: Location, _: Option<&str>) {
         self.events.lock().push(Event::Heard(name.to_owned()));
     }
 
-    fn heard_again(&self, _: &str) {}
+    fn contact_seen_again(&self, _: &str) {}
 
     fn took(&self, _: &str, _: &Location) {}
 
@@ -68,7 +68,7 @@ impl Contacts for Publishing {
 
     fn introduced(&self, _: &Introduction) {}
 
-    fn parted(&self, _: &Introduction) {}
+    fn disconnected(&self, _: &Introduction) {}
 }
 
 /// A transport that records what it is to send.

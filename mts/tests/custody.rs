@@ -677,16 +677,16 @@ fn a_gateway_that_ends_returns_the_letters_in_its_custody() {
     }
     assert!(!gateway.core.has_open_letters());
     assert!(gateway.core.has_open_reports());
-    let told = |(_, parcel): &(AttemptId, Parcel)| match parcel.body {
+    let reported = |(_, parcel): &(AttemptId, Parcel)| match parcel.body {
         Body::Report(Report::Returned { uncertain }) => {
             (parcel.sequence, parcel.transfer, uncertain)
         }
         _ => panic!("{parcel:?}"),
     };
-    let mut told: Vec<_> = reports.iter().map(told).collect();
-    told.sort_unstable();
+    let mut reported: Vec<_> = reports.iter().map(reported).collect();
+    reported.sort_unstable();
     assert_eq!(
-        told,
+        reported,
         [(5, 70, true), (6, 71, false), (7, 72, true), (8, 73, false)]
     );
     // A report that is lost is repeated.

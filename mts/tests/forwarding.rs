@@ -113,7 +113,7 @@ impl Gateway {
     /// The next action except contacts.
     fn next(&mut self) -> Option<Action> {
         match self.poll_action() {
-            Some(Action::Heard { .. } | Action::Suspect { .. }) => self.poll_action(),
+            Some(Action::ContactSeen { .. } | Action::Suspect { .. }) => self.poll_action(),
             other => other,
         }
     }
@@ -468,7 +468,7 @@ fn an_unknown_sender_becomes_a_contact() {
         Reaction::Later
     );
     match gateway.poll_action() {
-        Some(Action::Heard {
+        Some(Action::ContactSeen {
             name,
             agent,
             location,

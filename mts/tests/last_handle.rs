@@ -29,9 +29,9 @@ struct Halting {
 }
 
 impl Contacts for Halting {
-    fn heard(&self, _: &str, _: Incarnation, _: Location, _: Option<&str>) {}
+    fn contact_seen(&self, _: &str, _: Incarnation, _: Location, _: Option<&str>) {}
 
-    fn heard_again(&self, _: &str) {}
+    fn contact_seen_again(&self, _: &str) {}
 
     fn took(&self, _: &str, _: &Location) {}
 
@@ -44,7 +44,7 @@ impl Contacts for Halting {
         let _ = self.go_on.lock().recv_timeout(TIMEOUT);
     }
 
-    fn parted(&self, _: &Introduction) {}
+    fn disconnected(&self, _: &Introduction) {}
 }
 
 #[test]

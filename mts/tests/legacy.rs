@@ -262,9 +262,9 @@ fn letters_that_waited_for_a_dead_peer_report_the_attempts() {
     }
     // Each failure message contains it, too.
     for _ in 0..3 {
-        let told = bench.core.take(ROVER).unwrap();
-        let told = Message::decode(told.letter.payload()).unwrap();
-        let text = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+        let failure = bench.core.take(ROVER).unwrap();
+        let failure = Message::decode(failure.letter.payload()).unwrap();
+        let text = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
         assert!(text.contains("unreachable: tcp://10.0.0.3:6789"), "{text}");
     }
     // The next letter does not report the attempts of earlier ones.

@@ -69,7 +69,8 @@ fn now() -> Now {
 fn dispatched(core: &mut Core) -> Option<(AttemptId, Location, Parcel)> {
     loop {
         match core.poll_action()? {
-            Action::Heard { .. } | Action::HeardAgain { .. } | Action::Taken { .. } => {}
+            Action::ContactSeen { .. } | Action::ContactSeenAgain { .. } | Action::Taken { .. } => {
+            }
             Action::Refresh { number } => core.handle_refreshed(now(), number),
             Action::Dispatch {
                 attempt,
@@ -277,10 +278,10 @@ fn a_refused_sender_gets_failure_messages_in_its_dialect_at_a_limited_rate() {
 }
 
 /// The agents that became contacts, and their locations.
-fn heard(core: &mut Core) -> Vec<(String, String)> {
+fn contacts_of(core: &mut Core) -> Vec<(String, String)> {
     let actions = std::iter::from_fn(|| core.poll_action());
-    let heard = actions.filter_map(|action| match action {
-        Action::Heard {
+    let contacts_of = actions.filter_map(|action| match action {
+        Action::ContactSeen {
             name,
             agent,
             location,
@@ -291,7 +292,7 @@ fn heard(core: &mut Core) -> Vec<(String, String)> {
         }
         _ => None,
     });
-    heard.collect()
+    contacts_of.collect()
 }
 
 #[test]
@@ -305,12 +306,12 @@ fn the_sender_of_a_recorded_letter_becomes_a_contact_at_its_stated_address() {
     let mut core = host();
     arrives(&mut core, recorded(LETTER), HERE);
     let at = "tcp://127.0.0.1:45615;fipa-services";
-    assert_eq!(heard(&mut core), known(at));
+    assert_eq!(contacts_of(&mut core), known(at));
 
     // An address of another host is ignored.
     let mut core = host();
     arrives(&mut core, recorded(LETTER), IpAddr::from([10, 0, 0, 66]));
-    assert_eq!(heard(&mut core), []);
+    assert_eq!(contacts_of(&mut core), []);
 
     // Without addresses in the message, those in the envelope count.
     let plain = Message::builder(Performative::Inform)
@@ -320,7 +321,7 @@ fn the_sender_of_a_recorded_letter_becomes_a_contact_at_its_stated_address() {
         .unwrap();
     let letter = Letter::new(recorded(LETTER).envelope(), plain.to_payload());
     arrives(&mut core, letter, HERE);
-    assert_eq!(heard(&mut core), known(at));
+    assert_eq!(contacts_of(&mut core), known(at));
 }
 
 /// Handles a letter of each of these agents of one address.
@@ -346,15 +347,15 @@ fn agents_become_known_by_letters_at_a_limited_rate() {
     let then = now();
     // The agents of a platform begin together.
     written_by(&mut core, then, 0..900);
-    assert_eq!(heard(&mut core).len(), 900);
+    assert_eq!(contacts_of(&mut core).len(), 900);
     written_by(&mut core, then, 900..1100);
-    assert_eq!(heard(&mut core).len(), 100);
+    assert_eq!(contacts_of(&mut core).len(), 100);
     let later = Now {
         instant: then.instant + Duration::from_secs(1),
         ..then
     };
     written_by(&mut core, later, 1100..1200);
-    assert_eq!(heard(&mut core).len(), 50);
+    assert_eq!(contacts_of(&mut core).len(), 50);
 }
 
 #[test]
@@ -384,17 +385,21 @@ fn an_agent_that_became_known_by_a_letter_keeps_its_name_until_it_is_silent() {
         let mut unframed = read(&core, letter, Kind::Tcp, from);
         core.handle_unframed(then, Duration::from_secs(5), &mut unframed);
         let action = std::iter::from_fn(|| core.poll_action()).find_map(|action| match action {
-            Action::Heard {
+            Action::ContactSeen {
                 name,
                 agent,
                 location,
                 ..
             } => {
-                let heard = contacts.heard(then.instant, &name, agent, location);
-                Some(if heard.is_ok() { "known" } else { "refused" })
+                let contacts_of = contacts.record_sender(then.instant, &name, agent, location);
+                Some(if contacts_of.is_ok() {
+                    "known"
+                } else {
+                    "refused"
+                })
             }
-            Action::HeardAgain { name } => {
-                contacts.heard_again(then.instant, &name);
+            Action::ContactSeenAgain { name } => {
+                contacts.record_further_letter(then.instant, &name);
                 Some("heard again")
             }
             _ => None,

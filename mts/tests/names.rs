@@ -159,21 +159,21 @@ fn a_gateway_refuses_letters_of_its_own_host_with_misleading_names() {
 fn letters_of_legacy_peers_with_misleading_names_are_refused() {
     for (letter, _) in misleading() {
         let mut core = core(false);
-        let here = Registration::new("arm", ARM, Vec::new());
+        let registration = Registration::new("arm", ARM, Vec::new());
         let directory = MemoryDirectory::new(MtsId::new("mts", Incarnation::from_u64(7)));
-        directory.register(here).unwrap();
+        directory.register(registration).unwrap();
         let mut unframed = Unframed::read(letter, Kind::Tcp, PEER, &directory).unwrap();
         core.handle_unframed(now(), Duration::from_secs(5), &mut unframed);
         assert!(unframed.is_handled());
         assert_eq!(core.waiting(ARM), 0);
-        let heard = std::iter::from_fn(|| core.poll_action());
-        let mut heard = heard.filter(|it| matches!(it, Action::Heard { .. }));
-        assert!(heard.next().is_none(), "the sender is no contact");
+        let contacts = std::iter::from_fn(|| core.poll_action());
+        let mut contacts = contacts.filter(|it| matches!(it, Action::ContactSeen { .. }));
+        assert!(contacts.next().is_none(), "the sender is no contact");
     }
     let mut core = core(false);
     let directory = MemoryDirectory::new(MtsId::new("mts", Incarnation::from_u64(7)));
-    let here = Registration::new("arm", ARM, Vec::new());
-    directory.register(here).unwrap();
+    let registration = Registration::new("arm", ARM, Vec::new());
+    directory.register(registration).unwrap();
     let clean = letter(&message("rover", "arm", "rover"));
     let mut unframed = Unframed::read(clean, Kind::Tcp, PEER, &directory).unwrap();
     core.handle_unframed(now(), Duration::from_secs(5), &mut unframed);

@@ -115,7 +115,7 @@ fn a_peer_that_answers_is_checked_seldom_and_after_its_connection_ends() {
     bench.answers(attempt);
     bench.now.instant += Duration::from_secs(1);
     let location: Location = "tcp://a:2".parse().unwrap();
-    let parted = Introduction {
+    let disconnected = Introduction {
         name: "crex".into(),
         hop: Hop {
             location: location.clone(),
@@ -124,18 +124,18 @@ fn a_peer_that_answers_is_checked_seldom_and_after_its_connection_ends() {
         dialed: Some(location),
         mandate: Mandate::Unproved,
     };
-    bench.core.handle_parted(bench.now, &parted);
+    bench.core.handle_disconnected(bench.now, &disconnected);
     assert_eq!(bench.wait(), Duration::ZERO);
     let (attempt, _) = bench.asked().unwrap();
     bench.answers(attempt);
     // A connection that ends frequently does not cause frequent checks.
-    bench.core.handle_parted(bench.now, &parted);
+    bench.core.handle_disconnected(bench.now, &disconnected);
     assert_eq!(bench.wait(), Duration::from_millis(200));
     // A peer that answers and ends each connection is checked less and less often.
     for pause in [400, 800, 1600, 2000, 2000] {
         let (attempt, _) = bench.asked().unwrap();
         bench.answers(attempt);
-        bench.core.handle_parted(bench.now, &parted);
+        bench.core.handle_disconnected(bench.now, &disconnected);
         assert_eq!(bench.wait(), Duration::from_millis(pause));
     }
     // A connection that lasts until the next check resets the pause.
@@ -146,7 +146,7 @@ fn a_peer_that_answers_is_checked_seldom_and_after_its_connection_ends() {
     }
     let (attempt, _) = bench.asked().unwrap();
     bench.answers(attempt);
-    bench.core.handle_parted(bench.now, &parted);
+    bench.core.handle_disconnected(bench.now, &disconnected);
     assert_eq!(bench.wait(), Duration::from_millis(200));
 }
 
@@ -241,7 +241,7 @@ fn peers_are_checked_at_once_after_a_network_change() {
 fn a_greeting_opens_a_connection_and_is_not_repeated() {
     let mut bench = Bench::new();
     let at: Location = "tcp://a:2".parse().unwrap();
-    bench.core.greet(vec![("crex".into(), at)]);
+    bench.core.announce_locations(vec![("crex".into(), at)]);
     let (attempt, asked) = bench.asked().unwrap();
     assert_eq!(asked, "tcp://a:2");
     bench.fails(attempt);

@@ -82,8 +82,8 @@ impl Bench {
         let contacts = Arc::new(ContactDirectory::new());
         for (name, agent, gateway) in agents {
             let location = at(*gateway, "tcp://192.0.2.4:1");
-            let heard = contacts.heard(Instant::now(), name, *agent, location);
-            heard.unwrap();
+            let reaction = contacts.record_sender(Instant::now(), name, *agent, location);
+            reaction.unwrap();
         }
         let all: Vec<Arc<dyn Directory>> = vec![own, contacts];
         let config = CoreConfig {
@@ -252,8 +252,8 @@ fn an_unknown_sender_belongs_to_the_first_link() {
 fn a_service_that_introduces_itself_as_an_agent_of_another_host_takes_nothing_from_it() {
     let mut bench = Bench::new();
     let stranger = Incarnation::from_u64(99);
-    let heard = bench.letter(link(HONEST, HONEST), (stranger, ARM), 1);
-    assert_eq!(heard, Reaction::Later);
+    let reaction = bench.letter(link(HONEST, HONEST), (stranger, ARM), 1);
+    assert_eq!(reaction, Reaction::Later);
     for agent in [ROVER, stranger] {
         let introduction = Introduction {
             name: "rover".into(),
@@ -362,7 +362,7 @@ fn a_certificate_replaces_a_claim_without_proof() {
     bench.core.handle_introduced(bench.now, &proved);
     assert!(!bench.core.accepts(&claim));
     // The end of the claimant's connection changes nothing.
-    bench.core.handle_parted(bench.now, &claim);
+    bench.core.handle_disconnected(bench.now, &claim);
     assert!(!bench.core.accepts(&claim));
 }
 
@@ -647,7 +647,7 @@ fn letters_of_invented_senders_take_bounded_memory() {
 #[test]
 fn a_peer_that_invents_senders_makes_few_of_them_known() {
     let mut bench = Bench::new();
-    let heard = |bench: &mut Bench, number: u64| {
+    let reaction = |bench: &mut Bench, number: u64| {
         let message = Message::builder(Performative::Inform)
             .sender(AgentId::new(format!("invented_{number}")).unwrap())
             .receiver(AgentId::new("arm").unwrap());
@@ -657,13 +657,15 @@ fn a_peer_that_invents_senders_makes_few_of_them_known() {
         assert_eq!(verdict, Reaction::Later);
         let actions = std::iter::from_fn(|| bench.core.poll_action());
         actions
-            .filter(|action| matches!(action, Action::Heard { .. }))
+            .filter(|action| matches!(action, Action::ContactSeen { .. }))
             .count()
     };
-    let at_once: usize = (0..2000).map(|number| heard(&mut bench, number)).sum();
+    let at_once: usize = (0..2000).map(|number| reaction(&mut bench, number)).sum();
     assert_eq!(at_once, 1000);
     bench.now.instant += Duration::from_secs(1);
-    let later: usize = (2000..3000).map(|number| heard(&mut bench, number)).sum();
+    let later: usize = (2000..3000)
+        .map(|number| reaction(&mut bench, number))
+        .sum();
     assert_eq!(later, 50);
 }
 

@@ -107,9 +107,9 @@ impl Gateway {
         let after = entry(locations, source);
         let before = std::mem::replace(&mut self.entry, Arc::clone(&after));
         self.core.set_view(Arc::new(One(Arc::clone(&after))));
-        let left = self.core.handle_relocation(&before, &after);
+        let vacated = self.core.handle_relocation(&before, &after);
         self.core.handle_directory_change(self.now);
-        left
+        vacated
     }
 
     fn dispatched(&mut self) -> Option<(AttemptId, Location)> {

@@ -179,7 +179,7 @@ struct Service {
     insists: bool,
     copy: Option<Parcel>,
     /// Times at which the letter left, and its length.
-    left: Vec<Instant>,
+    dispatched_at: Vec<Instant>,
     len: usize,
 }
 
@@ -229,7 +229,7 @@ impl Service {
             reactions: Vec::new(),
             insists: false,
             copy: None,
-            left: Vec::new(),
+            dispatched_at: Vec::new(),
             len: 0,
         };
         service.register(ARM);
@@ -324,7 +324,7 @@ impl Service {
                 return;
             };
             self.now = self.now.max(next);
-            assert!(self.left.len() < 10_000, "a storm");
+            assert!(self.dispatched_at.len() < 10_000, "a storm");
             if coming.is_some_and(|at| at <= self.now) {
                 let Some(Reverse((_, number))) = self.coming.pop() else {
                     return;
@@ -373,7 +373,7 @@ impl Service {
                     parcel,
                 } if location.incarnation() == LIAR => {
                     if let Body::Letter(letter) = &parcel.body {
-                        self.left.push(self.now);
+                        self.dispatched_at.push(self.now);
                         self.len = letter.len();
                     }
                     let reactions = (self.liar)(&parcel);
@@ -404,9 +404,12 @@ impl Service {
 
     /// Checks that the letter left again, and at no time more often than it may.
     fn check(&self, what: &str) {
-        assert!(self.left.len() > 1, "{what}: the letter does not go again");
-        for (count, at) in (1_u32..).zip(&self.left) {
-            let seconds = (*at - self.left[0]).as_secs_f64();
+        assert!(
+            self.dispatched_at.len() > 1,
+            "{what}: the letter does not go again"
+        );
+        for (count, at) in (1_u32..).zip(&self.dispatched_at) {
+            let seconds = (*at - self.dispatched_at[0]).as_secs_f64();
             let content = f64::from(count - 1) * self.len as f64;
             assert!(
                 f64::from(count) <= 16.0 + 4.0 * seconds,
@@ -483,8 +486,8 @@ fn lower_predecessors_make_no_custodian_storm() {
     let service = Service::new(true, out_of_order_and_lowered);
     let service = service.forward(1 << 40, 500_000);
     service.check("lowered predecessor");
-    let at_once = service.left.iter();
-    let at_once = at_once.take_while(|at| **at - service.left[0] < DELAY * 20);
+    let at_once = service.dispatched_at.iter();
+    let at_once = at_once.take_while(|at| **at - service.dispatched_at[0] < DELAY * 20);
     assert_eq!(at_once.count(), 1 + 4, "a lower predecessor ends a pause");
 }
 

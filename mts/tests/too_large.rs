@@ -256,9 +256,12 @@ fn a_letter_has_at_most_1_mib_besides_its_content() {
             letter_by(&mut template, &long, utc).err(),
             LetterDraft::new(long, content, utc, &mut template).err(),
         ] {
-            let told = refused.unwrap().to_string();
-            assert!(told.contains("1048577 bytes besides its content"), "{told}");
-            assert!(told.contains("1048576"), "{told}");
+            let reason = refused.unwrap().to_string();
+            assert!(
+                reason.contains("1048577 bytes besides its content"),
+                "{reason}"
+            );
+            assert!(reason.contains("1048576"), "{reason}");
         }
     }
 }

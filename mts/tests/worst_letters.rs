@@ -342,8 +342,8 @@ fn a_letter_whose_failure_message_repeats_long_parts() {
         let read = Unframed::read(letter, Kind::Tcp, from, &*directory).unwrap();
         let what = format!("a failure message about a letter with {what}");
         let actions = in_portions(&mut core, &what, (bytes, read)).into_iter();
-        let told = actions.filter(|action| matches!(action, Action::Dispatch { .. }));
-        assert_eq!(told.count(), 1, "{what}");
+        let dispatches = actions.filter(|action| matches!(action, Action::Dispatch { .. }));
+        assert_eq!(dispatches.count(), 1, "{what}");
     }
 }
 
@@ -408,24 +408,24 @@ fn a_letter_for_a_full_lane() {
 fn crowded(agents: u64) -> (Core, Arc<dyn Directory>, Instant) {
     let (mut core, directory) = core_with(agents);
     let letter = letter(&["arm_0".to_owned()], 0);
-    let came = now();
+    let arrived_at = now();
     let mut lanes = 0;
     for sender in 0..LANES {
         let stream = (1_000_000 + sender, 100 + sender % agents);
         let arrival = arrival(stream, 1, Body::Letter(letter.clone()));
         let read = core.reader().read_arrival(&arrival);
-        match core.handle_read_arrival(came, Kind::Tcp, arrival, read) {
+        match core.handle_read_arrival(arrived_at, Kind::Tcp, arrival, read) {
             Reaction::Later => lanes += 1,
             verdict => assert_eq!(verdict, Reaction::Now(Answer::Busy)),
         }
         while let Some(action) = core.poll_action() {
             if let Action::Refresh { number } = action {
-                core.handle_refreshed(came, number);
+                core.handle_refreshed(arrived_at, number);
             }
         }
     }
     assert!(lanes > LANES / 2, "{lanes} lanes");
-    (core, directory, came.instant)
+    (core, directory, arrived_at.instant)
 }
 
 /// Handles timeouts as the runtime does, with the core locked for one call at a time, until none is due at this time.
@@ -448,11 +448,11 @@ fn timeouts(core: &mut Core, (most, what): (u64, &str), at: Instant) -> Vec<Acti
 /// The letters of many senders pass their deadlines at once.
 #[test]
 fn deadlines_of_many_lanes() {
-    let (mut core, _, came) = crowded(AGENTS);
+    let (mut core, _, arrived_at) = crowded(AGENTS);
     let ended = timeouts(
         &mut core,
         (MOST_STEPS, "deadlines of many lanes"),
-        came + DEADLINE,
+        arrived_at + DEADLINE,
     );
     let ended = ended.into_iter();
     let ended = ended.filter(|action| matches!(action, Action::Abandon { .. }));
@@ -464,30 +464,30 @@ fn deadlines_of_many_lanes() {
 fn full_lane() -> (Core, Arc<dyn Directory>, Instant, Vec<AttemptId>) {
     let (mut core, directory) = core();
     let letter = letter(&["arm_0".to_owned()], 0);
-    let came = now();
+    let arrived_at = now();
     for sequence in 1..1025 {
         let arrival = arrival((9, 100), sequence, Body::Letter(letter.clone()));
         let read = core.reader().read_arrival(&arrival);
-        let verdict = core.handle_read_arrival(came, Kind::Tcp, arrival, read);
+        let verdict = core.handle_read_arrival(arrived_at, Kind::Tcp, arrival, read);
         assert_eq!(verdict, Reaction::Later);
     }
     let mut sent = Vec::new();
     while let Some(action) = core.poll_action() {
         match action {
             Action::Dispatch { attempt, .. } => sent.push(attempt),
-            Action::Refresh { number } => core.handle_refreshed(came, number),
+            Action::Refresh { number } => core.handle_refreshed(arrived_at, number),
             _ => {}
         }
     }
-    (core, directory, came.instant, sent)
+    (core, directory, arrived_at.instant, sent)
 }
 
 /// All letters of a full lane pass their deadline at once.
 #[test]
 fn deadlines_of_a_full_lane() {
-    let (mut core, _, came, sent) = full_lane();
+    let (mut core, _, arrived_at, sent) = full_lane();
     let what = (MOST_STEPS_OF_A_LANE, "deadlines of a full lane");
-    let ended = timeouts(&mut core, what, came + DEADLINE);
+    let ended = timeouts(&mut core, what, arrived_at + DEADLINE);
     let answers = ended.iter();
     let answers = answers.filter(|action| matches!(action, Action::Answer { .. }));
     assert_eq!(answers.count(), 1024);
@@ -499,13 +499,13 @@ fn deadlines_of_a_full_lane() {
 /// The receiver of all letters of a full lane leaves, and its process refuses the letters that were sent.
 #[test]
 fn the_receiver_of_a_full_lane_leaves() {
-    let (mut core, directory, came, sent) = full_lane();
+    let (mut core, directory, arrived_at, sent) = full_lane();
     directory
         .deregister("arm_0", Incarnation::from_u64(100))
         .unwrap();
     drop(core.set_view(directory.view()));
     let now = Now {
-        instant: came,
+        instant: arrived_at,
         ..now()
     };
     let what = "the receiver of a full lane leaves";
@@ -540,25 +540,25 @@ fn the_receiver_of_a_full_lane_leaves() {
 /// A peer can announce and withdraw agents while many lanes have letters.
 #[test]
 fn changes_of_the_directory_with_many_lanes() {
-    let (mut core, directory, came) = crowded(AGENTS);
+    let (mut core, directory, arrived_at) = crowded(AGENTS);
     for (name, agent) in [("arm_0", 100), ("arm_1", 101)] {
         let agent = Incarnation::from_u64(agent);
-        let left = directory.lookup(name).unwrap();
+        let departed = directory.lookup(name).unwrap();
         directory.deregister(name, agent).unwrap();
         drop(core.set_view(directory.view()));
         bounded("a change of the directory", 0, || {
             let now = Now {
-                instant: came,
+                instant: arrived_at,
                 ..now()
             };
-            core.handle_departure(now, &left);
+            core.handle_departure(now, &departed);
             core.handle_directory_change(now);
         });
         while core.poll_action().is_some() {}
         timeouts(
             &mut core,
             (MOST_STEPS, "a change of the directory, continued"),
-            came,
+            arrived_at,
         );
     }
 }

@@ -11,9 +11,9 @@ use fipa_content::{Content, SlDialect, Term, Wff};
 use crate::description::{AMS_DESCRIPTION, CONSTRAINTS, Constraints, matches_agent};
 use crate::df::{authorize, result};
 use crate::exception::Exception;
-use crate::kept::{KeptDescription, Text, left, read_object};
 use crate::request::{self, Rejection, Request};
 use crate::search::max_results;
+use crate::stored::{StoredDescription, Text, lease_left, read_object};
 use crate::{
     AddressBook, AgentState, AmsDescription, ApDescription, Asker, Platform, PlatformAnswer,
     PlatformTime, addresses_for, limits, located,
@@ -137,7 +137,7 @@ impl Ams {
     /// Returns what a successor takes over: the owners and states that agents of this host have set, and
     /// the agents that platforms of other hosts have registered.
     #[must_use]
-    pub fn keep(&self, now: Instant) -> Vec<KeptDescription> {
+    pub fn keep(&self, now: Instant) -> Vec<StoredDescription> {
         let residents = self.residents.iter().map(|(name, (registration, set))| {
             let owner = (Platform::Host, name, *registration);
             (owner, set, None)
@@ -148,11 +148,11 @@ impl Ams {
         });
         let all = residents.chain(foreign);
         let all = all.filter_map(|((platform, name, registration), description, ends)| {
-            Some(KeptDescription {
+            Some(StoredDescription {
                 name: Arc::clone(name),
                 registration,
                 platform,
-                left: left(now, ends),
+                lease_left: lease_left(now, ends),
                 text: Text::of_term(&description.to_term())?,
             })
         });
@@ -173,31 +173,31 @@ impl Ams {
         &mut self,
         now: Instant,
         elapsed: Duration,
-        kept: &[KeptDescription],
+        descriptions: &[StoredDescription],
         residents: &[Resident],
         stays: impl Fn(Platform) -> bool,
     ) {
-        for kept in kept.iter().filter(|kept| stays(kept.platform)) {
+        for stored in descriptions.iter().filter(|stored| stays(stored.platform)) {
             let read = |term: &Term<'_>| AmsDescription::from_term(term).ok();
-            let Some(description) = read_object(kept.text.as_bytes(), read) else {
+            let Some(description) = read_object(stored.text.as_bytes(), read) else {
                 continue;
             };
             let name = description.name.as_ref();
-            let is_own = name.is_some_and(|name| *name.name() == *kept.name);
+            let is_own = name.is_some_and(|name| *name.name() == *stored.name);
             if !is_own || is_too_large(&description) {
                 continue;
             }
-            let name = Arc::clone(&kept.name);
-            if kept.platform == Platform::Host {
-                if registration_of(residents, &name) == Some(kept.registration) {
+            let name = Arc::clone(&stored.name);
+            if stored.platform == Platform::Host {
+                if registration_of(residents, &name) == Some(stored.registration) {
                     self.residents
-                        .insert(name, (kept.registration, description));
+                        .insert(name, (stored.registration, description));
                 }
-            } else if let Some(ends) = kept.ends(now, elapsed)
+            } else if let Some(ends) = stored.ends(now, elapsed)
                 && ends > now
-                && self.has_room(kept.platform)
+                && self.has_room(stored.platform)
             {
-                let key = (kept.platform, name);
+                let key = (stored.platform, name);
                 self.foreign.insert(key, Foreign { description, ends });
             }
         }

@@ -11,10 +11,10 @@ use fipa_content::{Content, SlDialect, Term, Wff};
 
 use crate::description::{Constraints, described};
 use crate::exception::Exception;
-use crate::kept::{KeptDescription, KeptSubscription, Text, left, read_object};
 use crate::remote::{self, LocalEntry, RemoteEntry};
 use crate::request::{self, Rejection, Request};
 use crate::search::{Comparisons, max_results};
+use crate::stored::{StoredDescription, StoredSubscription, Text, lease_left, read_object};
 use crate::subscription::{Subscription, checked_template};
 use crate::{
     AddressBook, AgentDescription, Asker, Platform, PlatformAnswer, PlatformTime, SubscriptionId,
@@ -73,7 +73,7 @@ struct Entry {
     /// The text for other hosts, of an agent of this host.
     text: Option<Arc<str>>,
     /// The text for a successor.
-    kept: Option<Text>,
+    stored_text: Option<Text>,
 }
 
 impl Entry {
@@ -94,7 +94,7 @@ impl Entry {
             ends,
             position,
             text,
-            kept: Text::of_term(&description.to_term()),
+            stored_text: Text::of_term(&description.to_term()),
             description,
         }
     }
@@ -300,16 +300,16 @@ impl Df {
     /// Returns what a successor takes over: the descriptions, the earliest registration first, and the
     /// subscriptions of agents without a registration.
     #[must_use]
-    pub fn keep(&self, now: Instant) -> (Vec<KeptDescription>, Vec<KeptSubscription>) {
+    pub fn keep(&self, now: Instant) -> (Vec<StoredDescription>, Vec<StoredSubscription>) {
         let mut entries: Vec<_> = self.entries.iter().collect();
         entries.sort_unstable_by_key(|(_, entry)| entry.position);
         let entries = entries.into_iter().filter_map(|(name, entry)| {
-            Some(KeptDescription {
+            Some(StoredDescription {
                 name: Arc::clone(name),
                 registration: entry.registration,
                 platform: entry.platform,
-                left: left(now, entry.ends),
-                text: entry.kept.clone()?,
+                lease_left: lease_left(now, entry.ends),
+                text: entry.stored_text.clone()?,
             })
         });
         let subscriptions = self.subscriptions.values();
@@ -330,18 +330,18 @@ impl Df {
         &mut self,
         now: PlatformTime,
         elapsed: Duration,
-        (entries, subscriptions): (&[KeptDescription], &[KeptSubscription]),
+        (entries, subscriptions): (&[StoredDescription], &[StoredSubscription]),
         stays: impl Fn(Platform) -> bool,
     ) {
-        for kept in entries {
-            let entry = self.kept_entry(now, elapsed, kept);
+        for stored in entries {
+            let entry = self.kept_entry(now, elapsed, stored);
             if let Some(entry) = entry {
                 self.registered += 1;
-                self.insert(Arc::clone(&kept.name), entry);
+                self.insert(Arc::clone(&stored.name), entry);
             }
         }
-        for kept in subscriptions.iter().filter(|kept| stays(kept.platform)) {
-            self.take_over_subscription(now, kept);
+        for stored in subscriptions.iter().filter(|stored| stays(stored.platform)) {
+            self.take_over_subscription(now, stored);
         }
         let gone = self.entries.iter().filter(|(_, it)| !stays(it.platform));
         let gone: Vec<Arc<str>> = gone.map(|(name, _)| Arc::clone(name)).collect();
@@ -355,20 +355,20 @@ impl Df {
         &self,
         now: PlatformTime,
         elapsed: Duration,
-        kept: &KeptDescription,
+        stored: &StoredDescription,
     ) -> Option<Entry> {
-        if self.entries.contains_key(&kept.name) || self.is_full(kept.platform) {
+        if self.entries.contains_key(&stored.name) || self.is_full(stored.platform) {
             return None;
         }
         let read = |term: &Term<'_>| AgentDescription::from_term(term).ok();
-        let description = read_object(kept.text.as_bytes(), read)?;
+        let description = read_object(stored.text.as_bytes(), read)?;
         description.check().ok()?;
         let name = description.name.as_ref()?;
-        if *name.name() != *kept.name || is_too_large(&description) {
+        if *name.name() != *stored.name || is_too_large(&description) {
             return None;
         }
-        let ends = kept.ends(now.at, elapsed);
-        let (platform, registration) = (kept.platform, kept.registration);
+        let ends = stored.ends(now.at, elapsed);
+        let (platform, registration) = (stored.platform, stored.registration);
         let position = self.registered;
         Some(Entry::new(
             platform,
@@ -379,8 +379,8 @@ impl Df {
         ))
     }
 
-    fn take_over_subscription(&mut self, now: PlatformTime, kept: &KeptSubscription) {
-        let Some((asker, message)) = kept.read() else {
+    fn take_over_subscription(&mut self, now: PlatformTime, stored: &StoredSubscription) {
+        let Some((asker, message)) = stored.read() else {
             return;
         };
         let Ok((mut subscription, _)) = Subscription::read(&message, &asker, &self.id, now.at)
@@ -390,7 +390,7 @@ impl Df {
         if self.make_room(&asker).is_err() {
             return;
         }
-        match &kept.changed {
+        match &stored.changed {
             Some(changed) => {
                 let changed = changed.iter().take(limits::CHANGES);
                 changed.for_each(|name| subscription.changed.insert(name));
@@ -847,7 +847,7 @@ impl Df {
             };
             if matches(before) || matches(after) {
                 subscription.changed.insert(name);
-                self.revision += u64::from(subscription.is_kept());
+                self.revision += u64::from(subscription.is_stored());
                 if subscription.changed.len() > limits::CHANGES {
                     overrun.insert(*id);
                 }
@@ -1001,9 +1001,9 @@ fn granted(
     let asked = match description.lease_time {
         None => None,
         Some(time) => {
-            let left = time.to_system_time(now.wall).duration_since(now.wall);
-            let left = left.ok().filter(|left| !left.is_zero());
-            Some(left.ok_or_else(invalid)?)
+            let lease_left = time.to_system_time(now.wall).duration_since(now.wall);
+            let lease_left = lease_left.ok().filter(|time| !time.is_zero());
+            Some(lease_left.ok_or_else(invalid)?)
         }
     };
     let lease = match asker.platform {

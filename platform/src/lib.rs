@@ -88,12 +88,12 @@ mod client;
 mod description;
 mod df;
 mod exception;
-mod kept;
 pub mod limits;
 mod remote;
 mod request;
 mod search;
 mod slots;
+mod stored;
 mod subscription;
 
 use std::sync::Arc;
@@ -111,8 +111,8 @@ pub use description::{
 };
 pub use df::Df;
 pub use exception::Exception;
-pub use kept::{KeptDescription, KeptSubscription};
 pub use remote::{LocalEntry, RemoteEntry};
+pub use stored::{StoredDescription, StoredSubscription};
 pub use subscription::SubscriptionId;
 
 /// The ontology of agent management (FIPA00023). Its case is ignored on reading.

@@ -9,7 +9,7 @@ use std::time::Instant;
 use fipa_acl::Time;
 use fipa_content::{SlDialect, Term};
 
-use crate::kept::read_object;
+use crate::stored::read_object;
 use crate::{AgentDescription, PlatformTime, limits, request};
 
 /// The description of an agent of this host, for the directory facilitators of other hosts.
@@ -90,7 +90,10 @@ pub(crate) fn read(now: PlatformTime, entry: &RemoteEntry) -> Option<AgentDescri
 
 /// Returns the lease of a remote entry as a time of the clock of this host.
 pub(crate) fn lease_time(now: PlatformTime, entry: &RemoteEntry) -> Option<Time> {
-    let left = entry.ends.saturating_duration_since(now.at);
-    let ends = now.wall.checked_add(left).filter(|_| entry.has_lease)?;
+    let lease_left = entry.ends.saturating_duration_since(now.at);
+    let ends = now
+        .wall
+        .checked_add(lease_left)
+        .filter(|_| entry.has_lease)?;
     Time::from_system_time(ends).ok()
 }

@@ -9,7 +9,7 @@ use fipa_content::{Content, ContentExpression, IdentifyingExpression, SlDialect,
 
 use crate::description::searched;
 use crate::exception::Exception;
-use crate::kept::{CHANGES, KeptSubscription};
+use crate::stored::{CHANGES, StoredSubscription};
 use crate::{AgentDescription, Asker, limits, request};
 
 /// The number of a subscription to a [`Df`](crate::Df).
@@ -20,7 +20,7 @@ pub struct SubscriptionId(pub(crate) u64);
 pub(crate) struct Subscription {
     pub(crate) asker: Asker,
     /// For a successor, of an agent without a registration.
-    kept: Option<KeptSubscription>,
+    stored: Option<StoredSubscription>,
     /// The message of the subscriber, without its content. Each notification answers it.
     pub(crate) message: Message,
     /// The text of the query, which each notification repeats.
@@ -101,13 +101,13 @@ impl Subscription {
         let agreed = request::print(asker.dialect, &agreed).map_err(unprintable)?;
         let equal = Wff::Equal(Box::new(query.into()), Box::new(Term::Boolean(true)));
         request::print(asker.dialect, &Content::from(equal)).map_err(unprintable)?;
-        let kept = match asker.registration {
+        let stored = match asker.registration {
             1.. => None,
-            0 => KeptSubscription::new(asker, without_content(message), &text),
+            0 => StoredSubscription::new(asker, without_content(message), &text),
         };
         let subscription = Self {
             asker: asker.clone(),
-            kept,
+            stored,
             message: without_content(message)
                 .build()
                 .map_err(|_| request::unrecognised_content())?,
@@ -135,21 +135,21 @@ impl Subscription {
     }
 
     /// Returns the copy for a successor.
-    pub(crate) fn keep(&self) -> Option<KeptSubscription> {
-        let mut kept = self.kept.clone()?;
+    pub(crate) fn keep(&self) -> Option<StoredSubscription> {
+        let mut copy = self.stored.clone()?;
         let changed = self.under_way.len() + self.changed.len();
         let all = self.under_way.iter().chain(&self.changed.order);
-        kept.changed = (changed <= CHANGES).then(|| all.cloned().collect());
-        Some(kept)
+        copy.changed = (changed <= CHANGES).then(|| all.cloned().collect());
+        Some(copy)
     }
 
-    pub(crate) fn is_kept(&self) -> bool {
-        self.kept.is_some()
+    pub(crate) fn is_stored(&self) -> bool {
+        self.stored.is_some()
     }
 
     /// Records that a notification about this agent leaves.
     pub(crate) fn leaves(&mut self, name: &Arc<str>) {
-        if self.kept.is_some() {
+        if self.stored.is_some() {
             self.under_way.push(Arc::clone(name));
         }
     }

@@ -13,8 +13,8 @@ use fipa_acl::{AgentId, Message, Performative, Time};
 use fipa_content::{SlDialect, Term};
 use fipa_platform::{
     AgentDescription, AgentState, AmsDescription, Asker, Constraints, Exception, Function,
-    KeptDescription, KeptSubscription, Platform, Property, ServiceDescription, limits, notified,
-    subscription,
+    Platform, Property, ServiceDescription, StoredDescription, StoredSubscription, limits,
+    notified, subscription,
 };
 
 fn subscribe_message(from: &str, conversation: &str) -> Message {
@@ -35,23 +35,23 @@ fn subscribe(it: &mut Facilitator, asker: &Asker, conversation: &str) {
     assert_eq!(*answer.message.performative(), Performative::Agree);
 }
 
-type Kept = (Vec<KeptDescription>, Vec<KeptSubscription>);
+type Kept = (Vec<StoredDescription>, Vec<StoredSubscription>);
 
 /// Passes what is kept through text.
-fn kept(it: &Facilitator, seconds: f64) -> Kept {
-    let kept = it.df.keep(it.clock.after(seconds).at);
-    let text = serde_json::to_string(&kept).unwrap();
+fn stored(it: &Facilitator, seconds: f64) -> Kept {
+    let stored = it.df.keep(it.clock.after(seconds).at);
+    let text = serde_json::to_string(&stored).unwrap();
     let read = serde_json::from_str(&text).unwrap();
-    assert_eq!(kept, read);
+    assert_eq!(stored, read);
     read
 }
 
 /// Returns a facilitator that takes over `elapsed` seconds later.
-fn successor(kept: &Kept, elapsed: f64, stays: impl Fn(Platform) -> bool) -> Facilitator {
+fn successor(stored: &Kept, elapsed: f64, stays: impl Fn(Platform) -> bool) -> Facilitator {
     let mut it = Facilitator::new();
     let now = it.clock.after(0.0);
     let elapsed = Duration::from_secs_f64(elapsed);
-    it.df.take_over(now, elapsed, (&kept.0, &kept.1), stays);
+    it.df.take_over(now, elapsed, (&stored.0, &stored.1), stays);
     it
 }
 
@@ -107,7 +107,7 @@ fn descriptions_come_back_with_their_leases() {
             .unwrap();
     }
     let before: Vec<_> = it.df.descriptions().cloned().collect();
-    let file = kept(&it, 10.0);
+    let file = stored(&it, 10.0);
     let mut next = successor(&file, 20.0, |_| true);
     assert!(next.df.descriptions().eq(&before));
     // The order of registration, which decides what travels to other hosts.
@@ -152,7 +152,7 @@ fn subscriptions_of_other_hosts_go_on_and_miss_nothing() {
     }
     // The first notification was on its way when the facilitator ended.
     assert_eq!(first.len(), 4);
-    let file = kept(&it, 0.0);
+    let file = stored(&it, 0.0);
     let mut next = successor(&file, 1.0, |_| true);
     assert_eq!(next.df.subscriptions(), 2);
     // An agent of this host ended meanwhile.
@@ -167,7 +167,7 @@ fn subscriptions_of_other_hosts_go_on_and_miss_nothing() {
     }
     assert!(notification(&mut next, 1.0).is_none());
     // The next successor does not repeat delivered notifications.
-    let file = kept(&next, 1.0);
+    let file = stored(&next, 1.0);
     let mut next = successor(&file, 1.0, |_| true);
     assert!(notification(&mut next, 0.0).is_none());
     next.register(&local("tower")).unwrap();
@@ -186,7 +186,7 @@ fn after_too_many_changes_all_that_match_are_told_again() {
     for number in 0..300 {
         it.register(&local(&format!("crane-{number}"))).unwrap();
     }
-    let mut next = successor(&kept(&it, 0.0), 1.0, |_| true);
+    let mut next = successor(&stored(&it, 0.0), 1.0, |_| true);
     let mut told = 0;
     let mut seconds = 0.0;
     while let Some((_, found)) = notification(&mut next, seconds) {
@@ -209,7 +209,7 @@ fn platforms_without_trust_leave_nothing_and_their_end_is_told() {
         subscribe(&mut it, &subscriber, "s-1");
         drain(&mut it);
     }
-    let mut next = successor(&kept(&it, 0.0), 1.0, |platform| platform != OTHER);
+    let mut next = successor(&stored(&it, 0.0), 1.0, |platform| platform != OTHER);
     assert_eq!(next.df.descriptions().count(), 0);
     assert_eq!(next.df.subscriptions(), 1);
     let (to, found) = notification(&mut next, 0.0).unwrap();
@@ -242,9 +242,9 @@ fn what_is_not_valid_is_left_out() {
     // Bounds hold, and no description of another host has a longer lease than such a host gets.
     let (mut file, _): Kept = serde_json::from_str(&text).unwrap();
     let mut far = file.pop().unwrap();
-    far.left = Some(u64::MAX);
+    far.lease_left = Some(u64::MAX);
     let json = serde_json::to_string(&far).unwrap();
-    let all: Vec<KeptDescription> = (0..limits::DESCRIPTIONS_OF_PLATFORM + 10)
+    let all: Vec<StoredDescription> = (0..limits::DESCRIPTIONS_OF_PLATFORM + 10)
         .map(|number| serde_json::from_str(&json.replace("far", &format!("far{number}"))).unwrap())
         .collect();
     let mut next = successor(&(all, Vec::new()), 0.0, |_| true);
@@ -259,7 +259,7 @@ fn what_is_not_valid_is_left_out() {
 #[test]
 fn the_revision_changes_with_what_is_kept() {
     let mut it = Facilitator::new();
-    let mut before = (it.df.revision(), kept(&it, 0.0));
+    let mut before = (it.df.revision(), stored(&it, 0.0));
     let far = asker("far", OTHER);
     let crane = local("crane");
     let modified = Function::modify(&full("crane"));
@@ -274,7 +274,7 @@ fn the_revision_changes_with_what_is_kept() {
     for (number, step) in steps.iter().enumerate() {
         step(&mut it);
         drain(&mut it);
-        let after = (it.df.revision(), kept(&it, 0.0));
+        let after = (it.df.revision(), stored(&it, 0.0));
         assert!(after.0 != before.0 && after.1 != before.1, "step {number}");
         before = after;
     }
@@ -308,7 +308,7 @@ fn agents_and_owners_come_back() {
         assert_ne!(it.ams.revision(), before);
     }
     let text = serde_json::to_string(&it.ams.keep(it.clock.after(0.0).at)).unwrap();
-    let file: Vec<KeptDescription> = serde_json::from_str(&text).unwrap();
+    let file: Vec<StoredDescription> = serde_json::from_str(&text).unwrap();
     let mut next = Management::new();
     // Another agent has the name of the one that ended.
     next.residents[1].registration = 77;
@@ -342,7 +342,7 @@ fn a_subscriber_that_asked_by_a_second_name_is_answered_from_it() {
     let content = subscription(&id("df@mts~2"), &all_lifting()).unwrap();
     let subscribe = message(Performative::Subscribe, "far", &content).language("fipa-sl2");
     it.tell(0.0, &far, &subscribe.build().unwrap()).unwrap();
-    let mut next = successor(&kept(&it, 0.0), 0.0, |_| true);
+    let mut next = successor(&stored(&it, 0.0), 0.0, |_| true);
     next.register(&local("crane")).unwrap();
     next.df.handle_timeout(next.clock.after(0.0).at);
     let answer = next.df.poll_answer().unwrap();

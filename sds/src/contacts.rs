@@ -16,7 +16,7 @@ use crate::entry::{millis_of_time, time_of_millis};
 use crate::table::Table;
 use crate::{Directory, Entry, EntryError, MtsId, Reach, Role, Source, Subscriber};
 
-/// The error of [`ContactDirectory::heard`].
+/// The error of [`ContactDirectory::record_sender`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ContactError {
@@ -72,7 +72,7 @@ struct Contact {
     /// The time of the last letter in either direction.
     used: Instant,
     /// The time of its last letter.
-    heard: Instant,
+    last_letter: Instant,
 }
 
 /// The place of a contact in the order in which contacts are replaced.
@@ -175,28 +175,28 @@ impl ContactDirectory {
     ///
     /// # Errors
     /// Fails when the name is not valid, another host has it, or there is no room.
-    pub fn heard(
+    pub fn record_sender(
         &self,
         now: Instant,
         name: &str,
         incarnation: Incarnation,
         location: Location,
-    ) -> Result<Heard, ContactError> {
+    ) -> Result<ContactChange, ContactError> {
         self.record(now, (name, incarnation), vec![location], None, false)
     }
 
-    /// Records an agent like [`heard`](Self::heard), whose address states this host name instead of the address of its
+    /// Records an agent like [`record_sender`](Self::record_sender), whose address states this host name instead of the address of its
     /// connection.
     ///
     /// # Errors
-    /// As for [`heard`](Self::heard).
-    pub fn heard_of_host(
+    /// As for [`record_sender`](Self::record_sender).
+    pub fn record_sender_of_host(
         &self,
         now: Instant,
         name: &str,
         location: Location,
         host_name: &str,
-    ) -> Result<Heard, ContactError> {
+    ) -> Result<ContactChange, ContactError> {
         let agent = (name, Incarnation::UNKNOWN);
         self.record(now, agent, vec![location], Some(host_name), false)
     }
@@ -206,14 +206,14 @@ impl ContactDirectory {
     /// replace those of an agent without a registration that has the name.
     ///
     /// # Errors
-    /// As for [`heard`](Self::heard), and if `locations` is empty.
+    /// As for [`record_sender`](Self::record_sender), and if `locations` is empty.
     pub fn introduce(
         &self,
         now: Instant,
         name: &str,
         locations: Vec<Location>,
         is_given: bool,
-    ) -> Result<Heard, ContactError> {
+    ) -> Result<ContactChange, ContactError> {
         if locations.is_empty() {
             return Err(ContactError::NoLocation);
         }
@@ -228,7 +228,7 @@ impl ContactDirectory {
         locations: Vec<Location>,
         host_name: Option<&str>,
         is_given: bool,
-    ) -> Result<Heard, ContactError> {
+    ) -> Result<ContactChange, ContactError> {
         let first = locations.first();
         let gateway = first.map_or(Incarnation::UNKNOWN, Location::incarnation);
         let host = PeerId::of(Principal::Unproved, first);
@@ -251,12 +251,12 @@ impl ContactDirectory {
         if let Some(known) = known {
             if known.entry.incarnation == incarnation && known.entry.locations == entry.locations {
                 contacts.use_now(now, name, |contact| {
-                    contact.heard = now;
+                    contact.last_letter = now;
                     if let Some(host_name) = host_name {
                         contact.host_name = Some(host_name.into());
                     }
                 });
-                return Ok(Heard::default());
+                return Ok(ContactChange::default());
             }
             let is_in_use = now.saturating_duration_since(known.used) < Self::SILENCE;
             let is_same = known.host == host
@@ -297,9 +297,9 @@ impl ContactDirectory {
             rank,
             host_name: host_name.map(Into::into),
             used: now,
-            heard: now,
+            last_letter: now,
         });
-        Ok(Heard { is_new, replaced })
+        Ok(ContactChange { is_new, replaced })
     }
 
     /// Takes a contact that made room out of the directory. Its entry tells senders when.
@@ -319,9 +319,9 @@ impl ContactDirectory {
     }
 
     /// Records another letter of a contact at `now`.
-    pub fn heard_again(&self, now: Instant, name: &str) {
+    pub fn record_further_letter(&self, now: Instant, name: &str) {
         let mut contacts = self.contacts.lock();
-        contacts.use_now(now, name, |contact| contact.heard = now);
+        contacts.use_now(now, name, |contact| contact.last_letter = now);
     }
 
     /// Records that a contact took a letter from an agent of this side at `now`.
@@ -371,9 +371,9 @@ impl ContactDirectory {
 
     fn drop_those(&self, mut which: impl FnMut(&Contact) -> bool) {
         let mut contacts = self.contacts.lock();
-        let left = contacts.all.values().filter(|contact| which(contact));
-        let left: Vec<Arc<Entry>> = left.map(|contact| Arc::clone(&contact.entry)).collect();
-        for entry in left {
+        let removed = contacts.all.values().filter(|contact| which(contact));
+        let removed: Vec<Arc<Entry>> = removed.map(|contact| Arc::clone(&contact.entry)).collect();
+        for entry in removed {
             contacts.remove(&entry.name);
             self.table.release((), &entry.name, entry.incarnation);
         }
@@ -386,7 +386,7 @@ impl ContactDirectory {
         let mut next: Option<Instant> = None;
         self.drop_those(|contact| {
             let gateway = contact.entry.mts.incarnation;
-            let until = contact.heard + Self::UNLISTED;
+            let until = contact.last_letter + Self::UNLISTED;
             let is_unlisted = now >= until && others.speaks_for(gateway);
             if is_unlisted || others.known(&contact.entry.name).is_some() {
                 return true;
@@ -407,7 +407,7 @@ impl ContactDirectory {
 
 /// What a letter changed in the contacts.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Heard {
+pub struct ContactChange {
     /// Whether this incarnation of the sender was not a contact before.
     pub is_new: bool,
     /// The contact that made room. Its time of registration is that of this change.
@@ -437,8 +437,8 @@ mod tests {
         Incarnation::from_u64(number)
     }
 
-    fn is_new() -> Result<Heard, ContactError> {
-        Ok(Heard {
+    fn is_new() -> Result<ContactChange, ContactError> {
+        Ok(ContactChange {
             is_new: true,
             replaced: None,
         })
@@ -448,14 +448,15 @@ mod tests {
     fn a_sender_is_a_contact_without_an_end_by_time() {
         let contacts = ContactDirectory::new();
         let start = Instant::now();
-        let heard = |at, number| contacts.heard(at, "arm", incarnation(number), location());
-        assert_eq!(heard(start, 1), is_new());
-        assert_eq!(heard(start, 1), Ok(Heard::default()));
+        let record =
+            |at, number| contacts.record_sender(at, "arm", incarnation(number), location());
+        assert_eq!(record(start, 1), is_new());
+        assert_eq!(record(start, 1), Ok(ContactChange::default()));
         let entry = contacts.lookup("arm").unwrap();
         assert_eq!(entry.locations, [location()]);
         assert_eq!(contacts.by_incarnation(incarnation(1)).unwrap(), entry);
         // Another incarnation at the same gateway replaces it.
-        assert_eq!(heard(start, 2), is_new());
+        assert_eq!(record(start, 2), is_new());
         assert!(contacts.by_incarnation(incarnation(1)).is_none());
         let month = start + Duration::from_secs(30 * 24 * 60 * 60);
         let next = contacts.forget(month, &nothing());
@@ -486,7 +487,7 @@ mod tests {
         assert_eq!(contacts.lookup("echo@jade").unwrap().locations, at(&[3]));
         // A registered agent of another gateway keeps its name.
         contacts
-            .heard(now, "arm", incarnation(1), location())
+            .record_sender(now, "arm", incarnation(1), location())
             .unwrap();
         let moved = contacts.introduce(now, "arm", at(&[3]), true);
         assert!(matches!(moved, Err(ContactError::Taken(_))), "{moved:?}");
@@ -499,7 +500,9 @@ mod tests {
         let state = |name: &str, host: u8| {
             let at = format!("http://192.0.2.{host}:7778/acc").parse().unwrap();
             let now = Instant::now();
-            contacts.heard_of_host(now, name, at, "crex").unwrap();
+            contacts
+                .record_sender_of_host(now, name, at, "crex")
+                .unwrap();
         };
         assert!(contacts.hosts_named("crex").is_empty());
         state("a@crex", 1);
@@ -516,26 +519,28 @@ mod tests {
     fn another_host_takes_over_the_name_of_a_silent_contact_only() {
         let contacts = ContactDirectory::new();
         let jade = |host: &str| -> Location { format!("http://{host}:7778/acc").parse().unwrap() };
-        let heard = |at, host| contacts.heard(at, "echo@jade", Incarnation::UNKNOWN, jade(host));
+        let record =
+            |at, host| contacts.record_sender(at, "echo@jade", Incarnation::UNKNOWN, jade(host));
         let start = Instant::now();
         let just_before = |at: Instant| at.checked_sub(Duration::from_millis(1)).unwrap();
-        heard(start, "192.0.2.1").unwrap();
+        record(start, "192.0.2.1").unwrap();
         let silent = start + ContactDirectory::SILENCE;
         let taken = Err(ContactError::Taken(jade("192.0.2.1")));
-        assert_eq!(heard(just_before(silent), "192.0.2.2"), taken);
+        assert_eq!(record(just_before(silent), "192.0.2.2"), taken);
         // A letter in either direction shows that it is there.
         contacts.took(just_before(silent), "echo@jade");
-        assert_eq!(heard(silent, "192.0.2.2"), taken);
-        contacts.heard_again(silent, "echo@jade");
+        assert_eq!(record(silent, "192.0.2.2"), taken);
+        contacts.record_further_letter(silent, "echo@jade");
         let later = silent + ContactDirectory::SILENCE;
-        assert_eq!(heard(just_before(later), "192.0.2.2"), taken);
-        assert_eq!(heard(later, "192.0.2.2").map(|it| it.is_new), Ok(false));
+        assert_eq!(record(just_before(later), "192.0.2.2"), taken);
+        assert_eq!(record(later, "192.0.2.2").map(|it| it.is_new), Ok(false));
         let entry = contacts.lookup("echo@jade").unwrap();
         assert_eq!(entry.locations, [jade("192.0.2.2")]);
         // On its own host, its port may change at any time.
         let moved: Location = "http://192.0.2.2:7779/acc".parse().unwrap();
-        let heard = contacts.heard(later, "echo@jade", Incarnation::UNKNOWN, moved.clone());
-        assert_eq!(heard, Ok(Heard::default()));
+        let record =
+            contacts.record_sender(later, "echo@jade", Incarnation::UNKNOWN, moved.clone());
+        assert_eq!(record, Ok(ContactChange::default()));
         let entry = contacts.lookup("echo@jade").unwrap();
         assert_eq!(entry.locations, [moved]);
     }
@@ -550,8 +555,9 @@ mod tests {
             "http://[::1]:7778/acc",
         ]) {
             let (name, location) = (format!("arm {number}"), at.parse().unwrap());
-            let heard = contacts.heard(Instant::now(), &name, incarnation(number), location);
-            assert_eq!(heard, is_new(), "{at}");
+            let record =
+                contacts.record_sender(Instant::now(), &name, incarnation(number), location);
+            assert_eq!(record, is_new(), "{at}");
             assert_eq!(contacts.lookup(&name).unwrap().mts.name, None);
         }
     }
@@ -570,7 +576,7 @@ mod tests {
         exchange.handle_neighbors(start, &[Present::unproved(mts, vec![location()])]);
         let known = exchange.directory();
         contacts
-            .heard(start, "arm", incarnation(1), location())
+            .record_sender(start, "arm", incarnation(1), location())
             .unwrap();
         let soon = start + ContactDirectory::UNLISTED;
         assert!(contacts.forget(soon, &*known) > Some(soon));
@@ -582,7 +588,7 @@ mod tests {
         assert!(contacts.lookup("arm").is_some());
         // Another letter shows that the agent is there.
         contacts
-            .heard(soon, "arm", incarnation(1), location())
+            .record_sender(soon, "arm", incarnation(1), location())
             .unwrap();
         let later = soon + ContactDirectory::UNLISTED;
         assert_eq!(contacts.forget(soon, &*known), Some(later));
@@ -595,10 +601,10 @@ mod tests {
         let contacts = ContactDirectory::new();
         let now = Instant::now();
         contacts
-            .heard(now, "arm", incarnation(1), location())
+            .record_sender(now, "arm", incarnation(1), location())
             .unwrap();
         contacts
-            .heard(now, "leg", incarnation(2), location())
+            .record_sender(now, "leg", incarnation(2), location())
             .unwrap();
         let known = StaticDirectory::new([("arm", vec![location()])]).unwrap();
         contacts.forget(now, &known);
@@ -607,13 +613,18 @@ mod tests {
     }
 
     /// Contacts of the host with this number, named by their numbers.
-    fn fill(contacts: &ContactDirectory, host: u8, numbers: std::ops::Range<usize>) -> Vec<Heard> {
-        let heard = numbers.map(|number| {
+    fn fill(
+        contacts: &ContactDirectory,
+        host: u8,
+        numbers: std::ops::Range<usize>,
+    ) -> Vec<ContactChange> {
+        let record = numbers.map(|number| {
             let (name, location) = (format!("{host} {number}"), at_host(host));
-            let heard = contacts.heard(Instant::now(), &name, Incarnation::UNKNOWN, location);
-            heard.unwrap()
+            let record =
+                contacts.record_sender(Instant::now(), &name, Incarnation::UNKNOWN, location);
+            record.unwrap()
         });
-        heard.collect()
+        record.collect()
     }
 
     fn at_host(host: u8) -> Location {
@@ -625,17 +636,17 @@ mod tests {
         let contacts = ContactDirectory::new();
         fill(&contacts, 2, 0..1);
         let most = ContactDirectory::MAX_OF_HOST;
-        let heard = fill(&contacts, 1, 0..most);
-        assert!(heard.iter().all(|it| it.replaced.is_none()));
+        let record = fill(&contacts, 1, 0..most);
+        assert!(record.iter().all(|it| it.replaced.is_none()));
         // The first was answered, the second is the subject of a subscription here, the third was heard again.
         contacts.took(Instant::now(), "1 0");
         contacts.pin(HashSet::from(["1 1".into()]));
-        contacts.heard_again(Instant::now(), "1 2");
+        contacts.record_further_letter(Instant::now(), "1 2");
         for (number, name) in (most..).zip(["1 3", "1 4"]) {
-            let heard = fill(&contacts, 1, number..number + 1).remove(0);
-            assert_eq!(&*heard.replaced.unwrap().name, name);
+            let record = fill(&contacts, 1, number..number + 1).remove(0);
+            assert_eq!(&*record.replaced.unwrap().name, name);
             assert!(contacts.lookup(name).is_none());
-            assert_eq!(&*contacts.view().lost(name).unwrap().name, name);
+            assert_eq!(&*contacts.view().lost_agent(name).unwrap().name, name);
         }
         let others = most + 2..2 * most - 1;
         fill(&contacts, 1, others.clone());
@@ -646,8 +657,8 @@ mod tests {
         // Now all others are answered, too.
         others.for_each(|number| contacts.took(Instant::now(), &format!("1 {number}")));
         let all = contacts.entries();
-        let left = all.iter().filter(|it| it.name.starts_with("1 "));
-        left.for_each(|it| contacts.took(Instant::now(), &it.name));
+        let of_host = all.iter().filter(|it| it.name.starts_with("1 "));
+        of_host.for_each(|it| contacts.took(Instant::now(), &it.name));
         fill(&contacts, 1, 2 * most..2 * most + 1);
         assert!(contacts.lookup("1 1").is_some());
         assert!(
@@ -659,7 +670,7 @@ mod tests {
         // A letter makes a replaced one a contact again.
         fill(&contacts, 1, 3..4);
         assert!(contacts.lookup("1 3").is_some());
-        assert!(contacts.view().lost("1 3").is_none());
+        assert!(contacts.view().lost_agent("1 3").is_none());
     }
 
     #[test]
@@ -683,8 +694,8 @@ mod tests {
         // Without one that is not answered, the longest unused makes room.
         all.iter()
             .for_each(|it| contacts.took(Instant::now(), &it.name));
-        let heard = fill(&contacts, 99, 0..1).remove(0);
-        assert_eq!(heard.replaced.unwrap().name, all[0].name);
+        let record = fill(&contacts, 99, 0..1).remove(0);
+        assert_eq!(record.replaced.unwrap().name, all[0].name);
         assert_eq!(contacts.entries().len(), most);
     }
 
@@ -695,14 +706,15 @@ mod tests {
         fill(&contacts, 1, 0..most);
         let all = contacts.entries();
         contacts.pin(all.iter().map(|it| Arc::clone(&it.name)).collect());
-        let heard =
-            |name: &str| contacts.heard(Instant::now(), name, Incarnation::UNKNOWN, at_host(1));
-        assert_eq!(heard("another"), Err(ContactError::Full));
-        assert_eq!(heard("1 7"), Ok(Heard::default()));
+        let record = |name: &str| {
+            contacts.record_sender(Instant::now(), name, Incarnation::UNKNOWN, at_host(1))
+        };
+        assert_eq!(record("another"), Err(ContactError::Full));
+        assert_eq!(record("1 7"), Ok(ContactChange::default()));
         assert_eq!(contacts.entries().len(), most);
         contacts.pin(HashSet::new());
-        assert!(heard("another").unwrap().replaced.is_some());
-        assert!(matches!(heard(""), Err(ContactError::Entry(_))));
-        assert!(matches!(heard("a\nb"), Err(ContactError::Entry(_))));
+        assert!(record("another").unwrap().replaced.is_some());
+        assert!(matches!(record(""), Err(ContactError::Entry(_))));
+        assert!(matches!(record("a\nb"), Err(ContactError::Entry(_))));
     }
 }

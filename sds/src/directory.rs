@@ -123,11 +123,11 @@ pub trait Directory: Send + Sync {
     /// Removes the registrations in `leaving`, then registers or updates those in `joining`. A
     /// failure of one does not affect the others.
     fn update(&self, leaving: &[(Arc<str>, Incarnation)], joining: Vec<Registration>) -> Updated {
-        let left = leaving
+        let removals = leaving
             .iter()
             .map(|(name, incarnation)| self.deregister(name, *incarnation));
         Updated {
-            left: left.collect(),
+            removed: removals.collect(),
             joined: joining.into_iter().map(|one| self.register(one)).collect(),
         }
     }
@@ -155,7 +155,7 @@ pub trait Directory: Send + Sync {
 #[derive(Debug)]
 pub struct Updated {
     /// Results of the removals.
-    pub left: Vec<Result<(), DeregisterError>>,
+    pub removed: Vec<Result<(), DeregisterError>>,
     /// Results of the registrations.
     pub joined: Vec<Result<Arc<Entry>, RegisterError>>,
 }

@@ -189,8 +189,8 @@ impl View for Merged {
         Arc::clone(self.sorted.get_or_init(|| merged_entries(&self.views)))
     }
 
-    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
-        self.views.iter().find_map(|one| one.lost(name))
+    fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
+        self.views.iter().find_map(|one| one.lost_agent(name))
     }
 
     fn is_authority(&self, mts: Incarnation) -> bool {

@@ -443,8 +443,8 @@ impl View for Layers {
         let Some(beneath) = &self.beneath else {
             return holders;
         };
-        let mut kept = self.all.lock();
-        if let Some(all) = kept.as_ref().and_then(Weak::upgrade) {
+        let mut cached = self.all.lock();
+        if let Some(all) = cached.as_ref().and_then(Weak::upgrade) {
             return all;
         }
         let beneath = beneath.all();
@@ -455,12 +455,12 @@ impl View for Layers {
         // Both parts are sorted, of which this takes advantage.
         all.sort_by(|a, b| a.name.cmp(&b.name));
         let all = all.into();
-        *kept = Some(Arc::downgrade(&all));
+        *cached = Some(Arc::downgrade(&all));
         all
     }
 
-    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
-        self.holders.lost(name)
+    fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
+        self.holders.lost_agent(name)
     }
 }
 

@@ -23,7 +23,7 @@ pub trait View: Send + Sync {
     fn all(&self) -> Arc<[Arc<Entry>]>;
 
     /// Returns the last entry of a [lost agent](Directory::lost_agents) of this name.
-    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
+    fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
         let _ = name;
         None
     }
@@ -55,7 +55,7 @@ impl<D: Directory + ?Sized> View for D {
         self.entries()
     }
 
-    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
+    fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
         self.lost_agents()
             .into_iter()
             .find(|lost| *lost.name == *name)
@@ -211,7 +211,7 @@ impl View for Snapshot {
         Some(Arc::clone(entry))
     }
 
-    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
+    fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
         self.lost.get(name).cloned()
     }
 
@@ -243,9 +243,9 @@ impl<const COUNT: usize> KeptEntries<COUNT> {
         find: impl FnOnce() -> Option<Arc<Entry>>,
     ) -> Option<Arc<Entry>> {
         let place = self.0.get(hash % COUNT)?;
-        let kept = place.lock().clone();
-        if let Some(kept) = kept.filter(|kept| is_it(kept)) {
-            return Some(kept);
+        let cached = place.lock().clone();
+        if let Some(entry) = cached.filter(|entry| is_it(entry)) {
+            return Some(entry);
         }
         let found = find()?;
         let replaced = place.lock().replace(Arc::clone(&found));

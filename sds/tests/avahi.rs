@@ -187,13 +187,19 @@ async fn split_values_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     drop(peer);
     gone(directory, "crane").await;
     // It joined once and left once, regardless of what arrived in between.
-    let mut told = Vec::new();
+    let mut changes = Vec::new();
     while let Some(change) = watch.try_next() {
-        told.push(change);
+        changes.push(change);
     }
-    assert!(matches!(told.first(), Some(Change::Joined(_))), "{told:?}");
-    assert!(matches!(told.last(), Some(Change::Left(_))), "{told:?}");
-    let between = &told[1..told.len() - 1];
+    assert!(
+        matches!(changes.first(), Some(Change::Joined(_))),
+        "{changes:?}"
+    );
+    assert!(
+        matches!(changes.last(), Some(Change::Left(_))),
+        "{changes:?}"
+    );
+    let between = &changes[1..changes.len() - 1];
     assert!(
         between
             .iter()

@@ -145,7 +145,7 @@ impl World {
             name: name.into(),
             incarnation: gateway.agents[name].incarnation,
             text: text.into(),
-            lease: lease.map(|left| self.now + left),
+            lease: lease.map(|removed| self.now + removed),
         };
         gateway.df.insert(name.to_owned(), entry);
         self.update_df(index);
@@ -261,7 +261,7 @@ impl World {
                     receiver.handle_unread(now, from);
                 } else {
                     match receiver.handle_letter(now, from, &letter.content) {
-                        Ok(()) | Err(ExchangeError::Stranger) => {}
+                        Ok(()) | Err(ExchangeError::NotConnected) => {}
                         Err(error) => panic!("{error}"),
                     }
                 }
@@ -407,12 +407,12 @@ fn df_entries_are_renewed_before_they_end() {
     for _ in 0..50 {
         world.run(hour / 10);
         for entry in world.gateways[1].exchange.directory().df_entries() {
-            let left = entry.ends.saturating_duration_since(world.now);
+            let removed = entry.ends.saturating_duration_since(world.now);
             match &*entry.name {
                 // Its lease is not renewed; the directory facilitator there removes it.
-                "rover" => assert!(left.is_zero()),
+                "rover" => assert!(removed.is_zero()),
                 name => {
-                    assert!(left > hour / 2 && left <= hour, "{name}: {left:?}");
+                    assert!(removed > hour / 2 && removed <= hour, "{name}: {removed:?}");
                     assert_eq!(entry.has_lease, name == "arm");
                 }
             }
@@ -580,7 +580,7 @@ fn agents_of_a_gateway_that_falls_silent_are_lost_for_a_minute() {
     world.connect();
     world.run(Duration::from_millis(300));
     let directory = world.gateways[1].exchange.directory();
-    let lost = |name: &str| directory.view().lost(name);
+    let lost = |name: &str| directory.view().lost_agent(name);
     let at = directory.lookup("arm").unwrap().locations.clone();
     let disconnect = |world: &mut World| {
         let now = world.now;
@@ -627,13 +627,13 @@ fn entries_of_a_gateway_without_trust_end_at_once() {
     world.run(Duration::from_millis(300));
     let gateway = Incarnation::from_u64(1);
     let contacts = Arc::new(ContactDirectory::new());
-    let heard = contacts.heard(
+    let recorded = contacts.record_sender(
         world.now,
         "leg",
         Incarnation::from_u64(7),
         location(0).with_incarnation(gateway),
     );
-    assert!(heard.unwrap().is_new);
+    assert!(recorded.unwrap().is_new);
     let directory = world.gateways[1].exchange.directory();
     let all = MergedDirectory::new(vec![
         Arc::clone(&contacts) as _,
@@ -693,13 +693,13 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let at = location(0).with_incarnation(new);
     let known = Present::unproved(world.gateways[0].mts.clone(), vec![location(0)]);
     let restarted = Present::unproved(MtsId::new("same-name-mts", new), vec![at]);
-    let told = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,"agents":
+    let handle = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,"agents":
         [{"name":"arm","type":"arm","id":"00000000000003e9","registered":1001}]}}}"#;
     let now = world.now;
     let exchange = &mut world.gateways[1].exchange;
     // A connection with the old one appears open: its entries stay.
     exchange.handle_neighbors(now, &[known, restarted.clone()]);
-    exchange.handle_letter(now, new, told).unwrap();
+    exchange.handle_letter(now, new, handle).unwrap();
     assert!(directory.speaks_for(old));
     // It ends: its entries leave at once, and those of the new one are there.
     exchange.handle_neighbors(now, std::slice::from_ref(&restarted));
@@ -714,7 +714,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     exchange.handle_neighbors(now, &[]);
     exchange.handle_neighbors(now, std::slice::from_ref(&started_again));
     assert_eq!(gateway(), Some(new));
-    exchange.handle_letter(now, newer, told).unwrap();
+    exchange.handle_letter(now, newer, handle).unwrap();
     assert_eq!(gateway(), Some(newer));
     assert!(!directory.speaks_for(new));
 
@@ -733,7 +733,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
         Some(newer),
         "no other gateway has sent its agents"
     );
-    exchange.handle_letter(now, newest, told).unwrap();
+    exchange.handle_letter(now, newest, handle).unwrap();
     assert!(exchange.handle_silence(now, &silent));
     assert!(!directory.speaks_for(newer));
     assert_eq!(gateway(), Some(newest));
@@ -795,10 +795,10 @@ fn gateways_that_never_become_neighbors_keep_no_others_from_being_asked() {
     let again = br#"{"version":1,"tell":"again"}"#;
     for stranger in 0..10_000 {
         let stranger = Incarnation::from_u64(1_000_000 + stranger);
-        let told = world.gateways[1]
+        let handle = world.gateways[1]
             .exchange
             .handle_letter(now, stranger, again);
-        assert!(matches!(told, Err(ExchangeError::Stranger)));
+        assert!(matches!(handle, Err(ExchangeError::NotConnected)));
     }
     let present = [Present::unproved(
         world.gateways[1].mts.clone(),
@@ -830,37 +830,40 @@ fn the_agents_of_a_gateway_are_bounded_also_by_changes() {
         r#"{"version":1,"tell":{"full":{"version":0,"first":true,"last":true,"agents":[]}}}"#;
     tell(&mut exchange, first.to_owned()).unwrap();
     let mut version = 0;
-    let mut change = |exchange: &mut Exchange, joined: &[usize], left: &[usize]| {
+    let mut change = |exchange: &mut Exchange, joined: &[usize], removed: &[usize]| {
         let joined: Vec<String> = joined.iter().map(|number| agent(*number)).collect();
-        let left: Vec<String> = left.iter().map(|it| format!(r#""agent_{it}""#)).collect();
-        let (joined, left, next) = (joined.join(","), left.join(","), version + 1);
-        let told = tell(
+        let removed: Vec<String> = removed
+            .iter()
+            .map(|it| format!(r#""agent_{it}""#))
+            .collect();
+        let (joined, removed, next) = (joined.join(","), removed.join(","), version + 1);
+        let handle = tell(
             exchange,
             format!(
-                r#"{{"version":1,"tell":{{"changes":{{"from":{version},"to":{next},"agents":[{joined}],"left":[{left}]}}}}}}"#
+                r#"{{"version":1,"tell":{{"changes":{{"from":{version},"to":{next},"agents":[{joined}],"removed":[{removed}]}}}}}}"#
             ),
         );
-        if told.is_ok() {
+        if handle.is_ok() {
             version = next;
         }
-        told
+        handle
     };
     let all: Vec<usize> = (0..Exchange::MAX_AGENTS).collect();
     for part in all.chunks(1000) {
         change(&mut exchange, part, &[]).unwrap();
     }
     let directory = exchange.directory();
-    let kept = directory.entries().len();
+    let listed = directory.entries().len();
     // The names are charged, too.
     assert!(
-        (Exchange::MAX_AGENTS * 19 / 20..Exchange::MAX_AGENTS).contains(&kept),
-        "{kept}"
+        (Exchange::MAX_AGENTS * 19 / 20..Exchange::MAX_AGENTS).contains(&listed),
+        "{listed}"
     );
     // One that leaves and returns, one that is named twice, and unknown ones.
     change(&mut exchange, &[3, 4, 4], &[3, 3, 1_000_000]).unwrap();
-    assert_eq!(directory.entries().len(), kept);
+    assert_eq!(directory.entries().len(), listed);
     change(&mut exchange, &[20_000], &[5, 1_000_000]).unwrap();
-    assert_eq!(directory.entries().len(), kept);
+    assert_eq!(directory.entries().len(), listed);
     assert!(directory.known("agent_5").is_none());
     assert!(directory.known("agent_3").is_some());
     assert!(directory.known("agent_20000").is_some());
@@ -1073,7 +1076,7 @@ fn a_name_moves_only_after_its_agent_has_left() {
     }
 }
 
-fn told(exchange: &mut Exchange, content: &str) -> Result<(), ExchangeError> {
+fn handle(exchange: &mut Exchange, content: &str) -> Result<(), ExchangeError> {
     let from = Incarnation::from_u64(7);
     exchange.handle_letter(Instant::now(), from, content.as_bytes())
 }
@@ -1092,7 +1095,7 @@ fn unknown_senders_and_malformed_letters_are_rejected() {
     let again = br#"{"version":1,"tell":"again"}"#;
     assert!(matches!(
         exchange.handle_letter(Instant::now(), stranger, again),
-        Err(ExchangeError::Stranger)
+        Err(ExchangeError::NotConnected)
     ));
     for nonsense in [
         "",
@@ -1103,13 +1106,13 @@ fn unknown_senders_and_malformed_letters_are_rejected() {
         &format!("{}1{}", "[".repeat(100_000), "]".repeat(100_000)),
     ] {
         assert!(matches!(
-            told(&mut exchange, nonsense),
+            handle(&mut exchange, nonsense),
             Err(ExchangeError::Malformed(_))
         ));
     }
     let large = " ".repeat(Exchange::MAX_CONTENT + 1);
     assert!(matches!(
-        told(&mut exchange, &large),
+        handle(&mut exchange, &large),
         Err(ExchangeError::TooLarge(_))
     ));
     assert!(exchange.directory().entries().is_empty());
@@ -1128,7 +1131,7 @@ fn invalid_agents_are_left_out() {
     let full = format!(
         r#"{{"version":1,"tell":{{"full":{{"version":0,"first":true,"last":true,"agents":{agents}}}}}}}"#
     );
-    told(&mut exchange, &full).unwrap();
+    handle(&mut exchange, &full).unwrap();
     let entries = exchange.directory().entries();
     assert_eq!(entries.len(), 1);
     assert_eq!(&*entries[0].name, "good");
@@ -1153,18 +1156,22 @@ fn the_number_of_agents_of_a_neighbor_is_bounded() {
         )
     };
     for (number, last) in [(0, false), (1, false), (2, true)] {
-        told(&mut exchange, &part(number, last)).unwrap();
+        handle(&mut exchange, &part(number, last)).unwrap();
     }
-    let kept = exchange.directory().entries();
+    let listed = exchange.directory().entries();
     assert!(
-        (4500..=Exchange::MAX_AGENTS).contains(&kept.len()),
+        (4500..=Exchange::MAX_AGENTS).contains(&listed.len()),
         "{}",
-        kept.len()
+        listed.len()
     );
-    assert!(kept.iter().all(|entry| entry.name.starts_with("agent 0 ")));
+    assert!(
+        listed
+            .iter()
+            .all(|entry| entry.name.starts_with("agent 0 "))
+    );
     // A part of an unknown list does not fit the stored state, and all entries are requested.
-    told(&mut exchange, &part(3, true)).unwrap();
-    assert_eq!(exchange.directory().entries().len(), kept.len());
+    handle(&mut exchange, &part(3, true)).unwrap();
+    assert_eq!(exchange.directory().entries().len(), listed.len());
     let now = Instant::now() + Duration::from_millis(1);
     let (to, question) = exchange.poll_letter(now).unwrap();
     assert_eq!(to, Incarnation::from_u64(7));
@@ -1459,7 +1466,7 @@ fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
     let many: Vec<(String, String)> = (0..4500)
         .map(|number| (format!("a{number}"), r#"{"entry":"lifting"}"#.to_owned()))
         .collect();
-    told(&mut exchange, &full_with_df(&many)).unwrap();
+    handle(&mut exchange, &full_with_df(&many)).unwrap();
     let directory = exchange.directory();
     assert_eq!(directory.entries().len(), 4500);
     assert_eq!(directory.df_entries().len(), Exchange::MAX_DF_ENTRIES);
@@ -1480,7 +1487,7 @@ fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
             from + 1,
             agents.join(",")
         );
-        told(&mut exchange, &changes).unwrap();
+        handle(&mut exchange, &changes).unwrap();
         let entries = directory.df_entries();
         assert!(entries.len() <= Exchange::MAX_DF_ENTRIES);
         let bytes: usize = entries.iter().map(|entry| entry.text.len()).sum();
@@ -1494,7 +1501,7 @@ fn df_entries_of_a_neighbor_are_bounded_and_its_agents_stay() {
         let letter = full_with_df(&agents)
             .replace(r#""first":true"#, &format!(r#""first":{}"#, part == 0))
             .replace(r#""last":true"#, &format!(r#""last":{}"#, part == 11));
-        told(&mut exchange, &letter).unwrap();
+        handle(&mut exchange, &letter).unwrap();
     }
     assert!(directory.entries().len() <= Exchange::MAX_AGENTS);
     let entries = directory.df_entries();
@@ -1531,7 +1538,7 @@ fn df_entries_that_are_too_long_or_of_others_are_ignored() {
         ("crane".to_owned(), df("lifting")),
     ];
     let now = Instant::now();
-    told(&mut exchange, &full_with_df(&agents)).unwrap();
+    handle(&mut exchange, &full_with_df(&agents)).unwrap();
     let directory = exchange.directory();
     assert_eq!(directory.entries().len(), 4);
     let mut entries = directory.df_entries();
@@ -1547,7 +1554,7 @@ fn df_entries_that_are_too_long_or_of_others_are_ignored() {
         r#""df""#,
         r#""coalition":{"members":["own_2"],"leader":"own_2"},"df""#,
     );
-    told(&mut exchange, &coalition).unwrap();
+    handle(&mut exchange, &coalition).unwrap();
     assert_eq!(directory.entries().len(), 1);
     assert!(directory.df_entries().is_empty());
 }
@@ -1665,7 +1672,7 @@ impl HostileLoad {
     fn lie(&mut self) {
         let at = self.honest();
         self.version += 1;
-        let told = match self.world.random.u32(..8) {
+        let handle = match self.world.random.u32(..8) {
             0 => serde_json::json!("goodbye"),
             1 => serde_json::json!("again"),
             how => {
@@ -1681,7 +1688,7 @@ impl HostileLoad {
                 }
             }
         };
-        let content = serde_json::json!({ "version": 1, "tell": told }).to_string();
+        let content = serde_json::json!({ "version": 1, "tell": handle }).to_string();
         let from = self.world.gateways[self.liar].mts.incarnation;
         let now = self.world.now;
         let taken = self.world.gateways[at]
@@ -1689,7 +1696,7 @@ impl HostileLoad {
             .handle_letter(now, from, content.as_bytes());
         // A gateway without a connection is a stranger; nothing else is wrong with the letters.
         assert!(
-            matches!(taken, Ok(()) | Err(ExchangeError::Stranger)),
+            matches!(taken, Ok(()) | Err(ExchangeError::NotConnected)),
             "{taken:?}"
         );
     }

@@ -267,8 +267,8 @@ async fn two_processes_cannot_have_one_name() {
         }
     }
     assert!(owners.values().all(|owners| *owners == 1), "{owners:?}");
-    let here = open(&dir);
-    assert_eq!(here.entries().len(), NAMES);
+    let directory = open(&dir);
+    assert_eq!(directory.entries().len(), NAMES);
 }
 
 #[tokio::test]
@@ -276,8 +276,8 @@ async fn a_killed_process_loses_its_names_at_once() {
     let (_parent, dir) = fresh_dir();
     let mut victim = Process::start(&dir);
     let mut witness = Process::start(&dir);
-    let here = open(&dir);
-    let mut watch = here.watch();
+    let directory = open(&dir);
+    let mut watch = directory.watch();
     for name in ["arm", "leg"] {
         assert_eq!(victim.ask(&format!("register {name}")), "ok");
         assert!(matches!(next(&mut watch).await, Change::Joined(_)));
@@ -285,16 +285,16 @@ async fn a_killed_process_loses_its_names_at_once() {
     }
 
     victim.kill();
-    let mut left = Vec::new();
+    let mut departed_names = Vec::new();
     for _ in 0..2 {
         match next(&mut watch).await {
-            Change::Left(entry) => left.push(entry.name.to_string()),
+            Change::Left(entry) => departed_names.push(entry.name.to_string()),
             other => panic!("{other:?}"),
         }
     }
-    left.sort();
-    assert_eq!(left, ["arm", "leg"]);
-    assert_eq!(here.lookup("arm"), None);
+    departed_names.sort();
+    assert_eq!(departed_names, ["arm", "leg"]);
+    assert_eq!(directory.lookup("arm"), None);
     while witness.ask("lookup leg") == "true" {}
     assert_eq!(witness.ask("register arm"), "ok");
     // Two processes, two lock files; and the entries of the one with a registration.
@@ -308,32 +308,32 @@ async fn a_killed_process_loses_its_names_at_once() {
         (files(&dir).len() == 2).then_some(())
     })
     .await;
-    drop(here);
+    drop(directory);
     assert_eq!(files(&dir), Vec::<String>::new());
 }
 
 #[tokio::test]
 async fn a_name_is_free_before_the_death_of_its_process_is_detected() {
     let (_parent, dir) = fresh_dir();
-    let here = open(&dir);
+    let directory = open(&dir);
     for _ in 0..10 {
         let mut victim = Process::start(&dir);
         assert_eq!(victim.ask("register arm"), "ok");
-        assert!(here.lookup("arm").is_some());
+        assert!(directory.lookup("arm").is_some());
         victim.kill();
         // No await in between: the watcher's task has not run.
         let again = registration("arm");
-        here.register(again.clone()).unwrap();
-        here.deregister("arm", again.incarnation).unwrap();
+        directory.register(again.clone()).unwrap();
+        directory.deregister("arm", again.incarnation).unwrap();
     }
 }
 
 #[tokio::test]
 async fn the_end_of_every_process_is_reported() {
     let (_parent, dir) = fresh_dir();
-    let here = open(&dir);
-    let mut departures = here.departures();
-    let told = async |departures: &mut fipa_sds::Departures| {
+    let directory = open(&dir);
+    let mut departures = directory.departures();
+    let departed = async |departures: &mut fipa_sds::Departures| {
         let watchdog = Duration::from_secs(60);
         tokio::time::timeout(watchdog, departures.next())
             .await
@@ -342,12 +342,12 @@ async fn the_end_of_every_process_is_reported() {
     // Neither process has registered an agent.
     let mut killed = Process::start(&dir);
     killed.kill();
-    assert!(told(&mut departures).await);
+    assert!(departed(&mut departures).await);
     let mut leaves = Process::start(&dir);
     assert_eq!(leaves.ask("close"), "ok");
-    assert!(told(&mut departures).await);
-    drop(here);
-    while told(&mut departures).await {}
+    assert!(departed(&mut departures).await);
+    drop(directory);
+    while departed(&mut departures).await {}
 }
 
 #[tokio::test]
@@ -356,15 +356,15 @@ async fn without_inotify_the_directory_is_polled() {
     let Some(mut polling) = Process::start_without_inotify(&dir) else {
         return;
     };
-    let here = open(&dir);
-    here.register(registration("arm")).unwrap();
+    let directory = open(&dir);
+    directory.register(registration("arm")).unwrap();
     while polling.ask("sees arm") == "false" {}
     assert_eq!(polling.ask("register leg"), "ok");
-    assert!(here.lookup("leg").is_some());
-    let _listening = here.listen().unwrap();
+    assert!(directory.lookup("leg").is_some());
+    let _listening = directory.listen().unwrap();
     assert_eq!(polling.ask("connect"), "ok");
     // A graceful end,
-    drop(here);
+    drop(directory);
     while polling.ask("sees arm") == "true" {}
     // and ends that no other process reports, of more processes than one poll checks.
     let mut victims: Vec<Process> = (0..10).map(|_| Process::start(&dir)).collect();
@@ -392,10 +392,10 @@ async fn the_last_one_cleans_up_after_the_killed() {
     }
     victims.iter_mut().for_each(Process::kill);
     assert_ne!(files(&dir), Vec::<String>::new());
-    let here = open(&dir);
-    assert_eq!(here.lookup("agent_0"), None);
-    assert_eq!(here.entries().len(), 0);
-    drop(here);
+    let directory = open(&dir);
+    assert_eq!(directory.lookup("agent_0"), None);
+    assert_eq!(directory.entries().len(), 0);
+    drop(directory);
     assert_eq!(files(&dir), Vec::<String>::new());
 }
 
@@ -519,10 +519,10 @@ async fn a_directory_that_is_not_private_is_refused() {
 #[tokio::test]
 async fn planted_files_are_rejected_and_links_not_followed() {
     let (parent, dir) = fresh_dir();
-    let here = open(&dir);
+    let directory = open(&dir);
     let mut other = Process::start(&dir);
     assert_eq!(other.ask("register arm"), "ok");
-    assert!(here.lookup("arm").is_some());
+    assert!(directory.lookup("arm").is_some());
     let theirs = files(&dir)
         .into_iter()
         .find(|name| name.ends_with(".entries"));
@@ -547,11 +547,11 @@ async fn planted_files_are_rejected_and_links_not_followed() {
         assert_ne!(bytes, good);
         plant(&bytes);
         until_some_async(&format!("refused: {bytes:.200}"), || {
-            here.known("arm").is_none().then_some(())
+            directory.known("arm").is_none().then_some(())
         })
         .await;
         plant(&good);
-        until_some_async("believed", || here.known("arm")).await;
+        until_some_async("believed", || directory.known("arm")).await;
     }
 
     // A pipe, and a symbolic link.
@@ -575,14 +575,14 @@ async fn planted_files_are_rejected_and_links_not_followed() {
     assert_eq!(newcomer.lookup("arm"), None);
     drop(newcomer);
     assert_eq!(other.ask("register leg"), "ok");
-    assert!(here.lookup("leg").is_some());
+    assert!(directory.lookup("leg").is_some());
     assert_eq!(std::fs::read_to_string(&precious).unwrap(), good);
 }
 
 #[tokio::test]
 async fn a_gateway_publishes_agents_of_other_hosts() {
     let (_parent, dir) = fresh_dir();
-    let here = open(&dir);
+    let directory = open(&dir);
     let entry = Entry {
         name: "camera".into(),
         agent_type: "sensor".to_owned(),
@@ -596,7 +596,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         peer: fipa_transport::PeerId::THIS_HOST,
         role: Role::Agent,
     };
-    let denied = here.publish_remote(&[Arc::new(entry.clone())], &[]);
+    let denied = directory.publish_remote(&[Arc::new(entry.clone())], &[]);
     assert!(matches!(denied, Err(HostError::NoGateway)));
 
     let gateway = HostDirectory::open(HostConfig {
@@ -613,7 +613,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
     gateway
         .publish_remote(&[Arc::new(entry.clone())], &[])
         .unwrap();
-    let found = here.lookup("camera").unwrap();
+    let found = directory.lookup("camera").unwrap();
     let expected = Entry {
         source: Source::Mdns,
         reach: Reach::Remote {
@@ -623,13 +623,13 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
     };
     assert_eq!(*found, expected);
     assert_eq!(gateway.lookup("camera"), None);
-    match here.register(registration("camera")) {
+    match directory.register(registration("camera")) {
         Err(RegisterError::AlreadyRegistered { holder }) => assert_eq!(*holder, expected),
         other => panic!("{other:?}"),
     }
 
     // Agents of this host precede those of the network, even if those state an earlier time.
-    let local = here.register(registration("arm")).unwrap();
+    let local = directory.register(registration("arm")).unwrap();
     let impostor = Entry {
         name: "arm".into(),
         ..entry
@@ -641,13 +641,13 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
     let third = open(&dir);
     assert_eq!(third.lookup("arm").unwrap().incarnation, local.incarnation);
     until_some_async("camera is withdrawn", || {
-        here.lookup("camera").is_none().then_some(())
+        directory.lookup("camera").is_none().then_some(())
     })
     .await;
     // Its gateway fell silent: the agent is no entry, but it is known.
-    for process in [&here, &third] {
+    for process in [&directory, &third] {
         process.refresh();
-        let lost = process.view().lost("camera").unwrap();
+        let lost = process.view().lost_agent("camera").unwrap();
         assert_eq!(lost.mts.shown(), "far-mts");
         assert_eq!(lost.locations, expected.locations);
         assert!(process.entries().iter().all(|it| *it.name != *"camera"));
@@ -825,23 +825,23 @@ async fn a_directory_that_was_removed_is_joined_again() {
 #[tokio::test]
 async fn a_name_that_was_registered_meanwhile_is_lost() {
     let (_parent, dir) = fresh_dir();
-    let here = open(&dir);
+    let directory = open(&dir);
     let ours = registration("arm");
-    here.register(ours.clone()).unwrap();
-    here.register(registration("leg")).unwrap();
+    directory.register(ours.clone()).unwrap();
+    directory.register(registration("leg")).unwrap();
     std::fs::remove_dir_all(&dir).unwrap();
     let newcomer = open(&dir);
     let theirs = registration("arm");
     newcomer.register(theirs.clone()).unwrap();
-    assert!(here.rejoin().unwrap());
-    for directory in [&here, &newcomer] {
+    assert!(directory.rejoin().unwrap());
+    for directory in [&directory, &newcomer] {
         assert_eq!(
             directory.lookup("arm").unwrap().incarnation,
             theirs.incarnation
         );
         assert!(directory.lookup("leg").is_some());
     }
-    assert!(here.deregister("arm", ours.incarnation).is_err());
+    assert!(directory.deregister("arm", ours.incarnation).is_err());
 }
 
 /// A late letter of an agent that has left makes it a contact on the host to which it moves.
@@ -854,7 +854,7 @@ async fn a_contact_keeps_no_agent_from_its_name() {
         ..config(&dir)
     })
     .unwrap();
-    let here = open(&dir);
+    let directory = open(&dir);
     let contact = Entry {
         name: "rover".into(),
         agent_type: String::new(),
@@ -869,9 +869,9 @@ async fn a_contact_keeps_no_agent_from_its_name() {
         role: Role::Agent,
     };
     gateway.publish_remote(&[Arc::new(contact)], &[]).unwrap();
-    assert_eq!(here.lookup("rover").unwrap().source, Source::Contact);
+    assert_eq!(directory.lookup("rover").unwrap().source, Source::Contact);
 
-    let rover = here.register(registration("rover")).unwrap();
+    let rover = directory.register(registration("rover")).unwrap();
     let third = open(&dir);
     assert_eq!(
         third.lookup("rover").unwrap().incarnation,
@@ -934,7 +934,7 @@ async fn a_gateway_with_too_many_agents_hides_no_agent_of_others() {
         ..config(&dir)
     };
     let gateway = HostDirectory::open(gateway).unwrap();
-    let here = open(&dir);
+    let directory = open(&dir);
     let quoted = "\"".repeat(Entry::MAX_DESCRIPTION);
     let liars = (1..=4).flat_map(|liar| (0..10_000).map(move |number| (liar, number)));
     let mut all: Vec<Arc<Entry>> = liars
@@ -945,8 +945,8 @@ async fn a_gateway_with_too_many_agents_hides_no_agent_of_others() {
     all.push(remote(8, 0, "two\nlines"));
     all.push(remote(8, 1, "one line"));
     gateway.publish_remote(&all, &[]).unwrap();
-    here.refresh();
-    let entries = here.entries();
+    directory.refresh();
+    let entries = directory.entries();
     let of = |gateway: u64| {
         let of = |entry: &&Arc<Entry>| entry.mts.incarnation == Incarnation::from_u64(gateway);
         entries.iter().filter(of).count()
@@ -964,7 +964,7 @@ async fn a_gateway_with_too_many_agents_hides_no_agent_of_others() {
     assert!(largest.unwrap() <= 64 << 20, "{largest:?}");
     // The gateway can still register agents of its own.
     gateway.register(registration("own")).unwrap();
-    assert!(here.lookup("own").is_some());
+    assert!(directory.lookup("own").is_some());
 }
 
 /// A process that is behind by more changes than the directory remembers reads all files. Its watcher does not run
@@ -972,11 +972,11 @@ async fn a_gateway_with_too_many_agents_hides_no_agent_of_others() {
 #[tokio::test]
 async fn a_process_that_is_far_behind_finds_every_agent() {
     let (_parent, dir) = fresh_dir();
-    let here = open(&dir);
+    let directory = open(&dir);
     let other = open(&dir);
     let third = open(&dir);
-    here.register(registration("here")).unwrap();
-    here.refresh();
+    directory.register(registration("here")).unwrap();
+    directory.refresh();
     third.register(registration("third")).unwrap();
     for number in 0..600 {
         let name = format!("agent-{}", number % 7);
@@ -990,7 +990,7 @@ async fn a_process_that_is_far_behind_finds_every_agent() {
     }
     let expected: Vec<String> = (0..7).map(|number| format!("agent-{number}")).collect();
     for name in expected.iter().map(String::as_str).chain(["third"]) {
-        assert!(here.lookup(name).is_some(), "{name}");
+        assert!(directory.lookup(name).is_some(), "{name}");
     }
 }
 
@@ -1041,8 +1041,8 @@ async fn watchers_receive_the_changes_of_agents_of_other_hosts() {
         ..config(&dir)
     };
     let gateway = HostDirectory::open(gateway).unwrap();
-    let here = open(&dir);
-    let mut watch = here.watch();
+    let directory = open(&dir);
+    let mut watch = directory.watch();
     let all: Vec<Arc<Entry>> = (0..5).map(|number| remote(2, number, "old")).collect();
     let end = |number| remote(3, number, "end");
     let publish = |agents: &[Arc<Entry>], ended| {
@@ -1052,7 +1052,7 @@ async fn watchers_receive_the_changes_of_agents_of_other_hosts() {
     publish(&all, 1);
     let changes = changes_until(&mut watch, "3-agent-1").await;
     assert_eq!(changes.len(), 6, "{changes:?}");
-    let view = here.view();
+    let view = directory.view();
     let changed = [
         remote(2, 0, "old"),
         remote(2, 1, "new"),
@@ -1073,9 +1073,9 @@ async fn watchers_receive_the_changes_of_agents_of_other_hosts() {
     // A view still has the agents of its time.
     assert_eq!(view.named("2-agent-1").unwrap().description, "old");
     assert_eq!(view.all().len(), 6);
-    assert!(here.known("2-agent-4").is_none());
-    assert_eq!(here.entries().len(), 4);
-    let found = here.by_incarnation(changed[2].incarnation).unwrap();
+    assert!(directory.known("2-agent-4").is_none());
+    assert_eq!(directory.entries().len(), 4);
+    let found = directory.by_incarnation(changed[2].incarnation).unwrap();
     assert_eq!(&*found.name, "2-agent-7");
 
     // An agent of this host hides one of another host of its name.
@@ -1085,7 +1085,7 @@ async fn watchers_receive_the_changes_of_agents_of_other_hosts() {
     gateway.publish_remote(&[end(3)], &[]).unwrap();
     changes_until(&mut watch, "3-agent-3").await;
     other.register(local.clone()).unwrap();
-    here.refresh();
+    directory.refresh();
     publish(&changed, 9);
     let changes = changes_until(&mut watch, "3-agent-9").await;
     let of_name = |change: &&Change| match change {
@@ -1100,21 +1100,25 @@ async fn watchers_receive_the_changes_of_agents_of_other_hosts() {
             || matches!(&*of_name, [Change::Joined(entry)] if entry.description == "local"),
         "{changes:?}"
     );
-    assert_eq!(here.known("2-agent-7").unwrap().description, "local");
-    assert!(here.known_incarnation(changed[2].incarnation).is_none());
-    assert_eq!(here.entries().len(), 4);
+    assert_eq!(directory.known("2-agent-7").unwrap().description, "local");
+    assert!(
+        directory
+            .known_incarnation(changed[2].incarnation)
+            .is_none()
+    );
+    assert_eq!(directory.entries().len(), 4);
     other.deregister("2-agent-7", local.incarnation).unwrap();
     let changes = changes_until(&mut watch, "2-agent-7").await;
     assert_eq!(kinds(&changes), ["local>old 2-agent-7"]);
-    assert_eq!(here.known("2-agent-7").unwrap().description, "old");
+    assert_eq!(directory.known("2-agent-7").unwrap().description, "old");
     // More changes than a watch holds are reported as one.
     let many: Vec<Arc<Entry>> = (0..2000).map(|number| remote(4, number, "")).collect();
     gateway.publish_remote(&many, &[]).unwrap();
     assert_eq!(next(&mut watch).await, Change::Lagged);
-    assert_eq!(here.entries().len(), 2000);
+    assert_eq!(directory.entries().len(), 2000);
     drop(gateway);
     assert_eq!(next(&mut watch).await, Change::Lagged);
-    assert_eq!(here.entries().len(), 0);
+    assert_eq!(directory.entries().len(), 0);
 }
 
 #[tokio::test]
@@ -1125,7 +1129,7 @@ async fn of_several_agents_with_one_incarnation_the_last_one_published_has_it() 
         ..config(&dir)
     };
     let gateway = HostDirectory::open(gateway).unwrap();
-    let here = open(&dir);
+    let directory = open(&dir);
     let of_same = |name: &str| {
         Arc::new(Entry {
             name: name.into(),
@@ -1134,10 +1138,10 @@ async fn of_several_agents_with_one_incarnation_the_last_one_published_has_it() 
     };
     let claims = [of_same("a"), of_same("c"), of_same("b")];
     gateway.publish_remote(&claims, &[]).unwrap();
-    let found = here.by_incarnation(claims[0].incarnation).unwrap();
+    let found = directory.by_incarnation(claims[0].incarnation).unwrap();
     assert_eq!(&*found.name, "b");
     for name in ["a", "b", "c"] {
-        assert_eq!(&*here.known(name).unwrap().name, name);
+        assert_eq!(&*directory.known(name).unwrap().name, name);
     }
     assert_eq!(HostDirectory::peek(&dir).unwrap().len(), 3);
 }

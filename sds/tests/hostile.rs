@@ -186,10 +186,10 @@ async fn a_flood_of_records_is_bounded_and_others_are_found() {
         if number % 50 == 0 {
             tokio::time::sleep(Duration::from_millis(1)).await;
             let sent = Instant::now();
-            while long && heard(&victim) < enough && sent.elapsed() < TIMEOUT {
+            while long && received_records(&victim) < enough && sent.elapsed() < TIMEOUT {
                 tokio::time::sleep(Duration::from_millis(1)).await;
             }
-            enough = heard(&victim) + 40;
+            enough = received_records(&victim) + 40;
         }
     }
     let status = victim.status();
@@ -279,7 +279,7 @@ async fn the_cache_of_the_library_is_bounded_and_no_agent_leaves() {
 }
 
 /// Number of records of others that were used or refused.
-fn heard(directory: &MdnsDirectory) -> u64 {
+fn received_records(directory: &MdnsDirectory) -> u64 {
     let status = directory.status();
     status.known as u64 + status.refused
 }

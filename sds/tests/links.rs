@@ -166,11 +166,11 @@ impl Member {
     }
 
     /// Registers an agent of that name, or deregisters it.
-    fn change(&mut self, name: &str, here: bool) {
+    fn change(&mut self, name: &str, joins: bool) {
         if let Some(incarnation) = self.own.remove(name) {
             self.directory.deregister(name, incarnation).unwrap();
         }
-        if here {
+        if joins {
             let agent = registration(name);
             self.directory.register(agent.clone()).unwrap();
             self.own.insert(name.to_owned(), agent.incarnation);

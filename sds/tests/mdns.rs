@@ -186,7 +186,7 @@ async fn mergers_and_splits_are_visible_at_once() {
         assert!(split.joined.iter().all(Result::is_ok), "{split:?}");
         look(2).await;
         let merged = one.update(&[(part.into(), ids[1])], vec![whole.clone()]);
-        assert!(merged.left[0].is_ok() && merged.joined[0].is_ok());
+        assert!(merged.removed[0].is_ok() && merged.joined[0].is_ok());
         look(1).await;
     }
     // Its end is visible at once, although no further beacon follows.

@@ -31,7 +31,7 @@ fn location() -> Location {
 }
 
 fn is_pattern(error: &EntryError, name: &str) -> bool {
-    matches!(error, EntryError::Name(NameError::Pattern(told)) if told == name)
+    matches!(error, EntryError::Name(NameError::Pattern(refused_name)) if refused_name == name)
 }
 
 /// Registers each name, then one that is no pattern.
@@ -65,8 +65,8 @@ async fn they_are_refused_at_registration() {
 fn they_are_refused_as_senders_of_letters_and_in_the_configuration() {
     let contacts = ContactDirectory::new();
     for name in PATTERNS {
-        let heard = contacts.heard(Instant::now(), name, MTS, location());
-        let Err(ContactError::Entry(refused)) = heard else {
+        let recorded = contacts.record_sender(Instant::now(), name, MTS, location());
+        let Err(ContactError::Entry(refused)) = recorded else {
             panic!("{name} is a contact");
         };
         assert!(is_pattern(&refused, name));

@@ -411,11 +411,11 @@ fn merged(bench: &Bench, unproved: Arc<dyn Directory>) -> MergedDirectory {
     MergedDirectory::new(vec![unproved, bench.exchange.directory()])
 }
 
-fn heard(name: &str, gateway: u64, agent: u64) -> Arc<ContactDirectory> {
+fn contact(name: &str, gateway: u64, agent: u64) -> Arc<ContactDirectory> {
     let contacts = ContactDirectory::new();
     let agent = Incarnation::from_u64(agent);
     contacts
-        .heard(Instant::now(), name, agent, location(gateway))
+        .record_sender(Instant::now(), name, agent, location(gateway))
         .unwrap();
     Arc::new(contacts)
 }
@@ -423,7 +423,7 @@ fn heard(name: &str, gateway: u64, agent: u64) -> Arc<ContactDirectory> {
 #[test]
 fn in_a_merged_view_proved_entries_come_first() {
     let mut bench = Bench::new(vec![present(1, certified(&[]))]);
-    let view = merged(&bench, heard("rover", 66, 6));
+    let view = merged(&bench, contact("rover", 66, 6));
     let mut watch = view.watch();
     assert_eq!(view.known("rover").unwrap().mts.incarnation.as_u64(), 66);
     // Its stated registration is long after the contact.
@@ -439,14 +439,14 @@ fn in_a_merged_view_proved_entries_come_first() {
     ));
     assert!(view.mandate(Incarnation::from_u64(1)).is_proved());
     // A merged view of merged views has the same result.
-    let outer = MergedDirectory::new(vec![heard("rover", 67, 7), Arc::new(view)]);
+    let outer = MergedDirectory::new(vec![contact("rover", 67, 7), Arc::new(view)]);
     assert!(is_proved(&outer));
 }
 
 #[test]
 fn in_a_merged_view_an_unproved_entry_takes_no_registration_of_a_proved_one() {
     let mut bench = Bench::new(vec![present(1, certified(&[]))]);
-    let view = merged(&bench, heard("crex", 66, agent_of(1).as_u64()));
+    let view = merged(&bench, contact("crex", 66, agent_of(1).as_u64()));
     let agent = || Some(view.known_incarnation(agent_of(1))?.name.to_string());
     assert_eq!(agent().as_deref(), Some("crex"));
     bench.tell(1, &["rover"], 9);
@@ -466,7 +466,7 @@ fn entries_of_the_configuration_precede_proved_ones() {
 #[test]
 fn other_directories_cannot_say_more_of_a_gateway_than_its_certificate() {
     let mut bench = Bench::new(Vec::new());
-    let view = merged(&bench, heard("crex", 1, 6));
+    let view = merged(&bench, contact("crex", 1, 6));
     let mut watch = view.watch();
     assert!(view.known("crex").is_some());
     bench.neighbors = vec![present(1, certified(&["rover"]))];

@@ -118,13 +118,13 @@ fn tells_departures(directory: &dyn Directory, leave: impl FnOnce()) {
     let all = directory.entries().len();
     leave();
     assert_ne!(directory.generation(), generation);
-    let mut left = 0;
+    let mut departures = 0;
     while let Some(change) = watch.try_next() {
         assert!(matches!(change, Change::Left(_)), "{change:?}");
-        left += 1;
+        departures += 1;
     }
-    assert!(left > 0);
-    assert_eq!(directory.entries().len(), all - left);
+    assert!(departures > 0);
+    assert_eq!(directory.entries().len(), all - departures);
 }
 
 fn contacts() -> (Instant, ContactDirectory) {
@@ -132,7 +132,7 @@ fn contacts() -> (Instant, ContactDirectory) {
     for (number, name) in (1..).zip(NAMES) {
         let incarnation = Incarnation::from_u64(number + 100);
         contacts
-            .heard(now, name, incarnation, location(number))
+            .record_sender(now, name, incarnation, location(number))
             .unwrap();
     }
     (now, contacts)
@@ -158,12 +158,14 @@ fn exchange() -> (Instant, Exchange, Arc<ExchangeDirectory>) {
     exchange.handle_neighbors(now, &gateways);
     for (number, name) in (1..).zip(NAMES) {
         let id = number + 100;
-        let told = format!(
+        let exchanged = format!(
             r#"{{"version":1,"tell":{{"full":{{"version":1,"first":true,"last":true,
             "agents":[{{"name":"{name}","id":"{id:016x}","registered":5}}]}}}}}}"#
         );
         let from = Incarnation::from_u64(number);
-        exchange.handle_letter(now, from, told.as_bytes()).unwrap();
+        exchange
+            .handle_letter(now, from, exchanged.as_bytes())
+            .unwrap();
     }
     let directory = exchange.directory();
     (now, exchange, directory)
@@ -201,24 +203,24 @@ fn entries_of_neighbors_conform() {
 
 #[test]
 fn merged_views_of_them_conform() {
-    let (_, _, told) = exchange();
-    let (now, heard) = contacts();
-    let heard = Arc::new(heard);
+    let (_, _, exchanged) = exchange();
+    let (now, contacts) = contacts();
+    let contacts = Arc::new(contacts);
     let empty = StaticDirectory::new::<&str>([]).unwrap();
-    let view = MergedDirectory::new(vec![Arc::new(empty), told, heard.clone()]);
+    let view = MergedDirectory::new(vec![Arc::new(empty), exchanged, contacts.clone()]);
     // Exchanged entries are kept for longer than contacts; each states its source.
     conforms(&view, Source::Exchange);
-    let only_heard = MergedDirectory::new(vec![heard.clone()]);
+    let only_heard = MergedDirectory::new(vec![contacts.clone()]);
     conforms(&only_heard, Source::Contact);
     tells_departures(&only_heard, || {
-        heard.forget(now, &named());
+        contacts.forget(now, &named());
     });
     // A writable directory makes the view writable.
     let memory = Arc::new(MemoryDirectory::new(MtsId::new(
         "own",
         Incarnation::random(),
     )));
-    let view = MergedDirectory::new(vec![heard, memory.clone()]);
+    let view = MergedDirectory::new(vec![contacts, memory.clone()]);
     let own = Registration::new("own", Incarnation::random(), Vec::new());
     view.register(own.clone()).unwrap();
     assert!(memory.lookup("own").is_some());

@@ -356,8 +356,11 @@ mod tests {
         let (gate, _gateway, _place) = gate(&[]);
         let letter = letter("rover", "crex", false);
         let judged = admits(&gate, Instant::now(), &letter, process_by(Kind::Shm));
-        let told = judged.unwrap_err();
-        assert!(told.contains("rover") && told.contains("crex"), "{told}");
+        let refusal = judged.unwrap_err();
+        assert!(
+            refusal.contains("rover") && refusal.contains("crex"),
+            "{refusal}"
+        );
     }
 
     #[tokio::test]

@@ -469,7 +469,7 @@ mod tests {
             assert_eq!(access.count(source, "agent", now), Ok(()));
         }
         let of = |source| access.senders.sources.get(&source).map(|it| it.order.len());
-        assert!(of(CREX).is_none_or(|left| left <= 1), "{:?}", of(CREX));
+        assert!(of(CREX).is_none_or(|age| age <= 1), "{:?}", of(CREX));
         let later = now + Duration::from_secs(1);
         assert_eq!(access.count(ROVER, "one more", later), Ok(()));
         assert_eq!(access.senders.len, 1, "the silent ones are forgotten");

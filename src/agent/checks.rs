@@ -164,7 +164,7 @@ impl Checks {
     }
 
     /// Checks a message that is about to be sent. Returns the receiver of its outcomes.
-    pub(crate) fn leaving(
+    pub(crate) fn check_outgoing(
         &self,
         message: &Message,
         directory: &dyn Directory,
@@ -549,7 +549,9 @@ mod tests {
             let call = part(Performative::Cfp, "arm", "rover").reply_by(by);
             assert_eq!(arrived(&call.build().unwrap()), None);
             let bid = part(Performative::Propose, "rover", "arm");
-            checks.leaving(&bid.build().unwrap(), &directory).unwrap();
+            checks
+                .check_outgoing(&bid.build().unwrap(), &directory)
+                .unwrap();
             let award = part(Performative::AcceptProposal, "arm", "rover");
             assert_eq!(arrived(&award.build().unwrap()), None);
         }

@@ -138,7 +138,7 @@ impl Endpoint {
         let unsettled = match checked {
             Checked::Yes => {
                 let directory = &*self.domain.inner.service.host;
-                self.checks.leaving(message, directory)?
+                self.checks.check_outgoing(message, directory)?
             }
             Checked::No => None,
         };

@@ -44,7 +44,7 @@ impl Nothing {
         Self
     }
 
-    pub(crate) fn leaving(
+    pub(crate) fn check_outgoing(
         &self,
         _message: &Message,
         _directory: &dyn Directory,

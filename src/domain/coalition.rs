@@ -125,8 +125,8 @@ impl Coalition {
         options: RegisterOptions,
     ) -> Result<Self, CoalitionError> {
         let is_ours = |name: &&str| self.members.names().iter().any(|ours| **ours == **name);
-        if let Some(stranger) = members.iter().find(|name| !is_ours(name)) {
-            return Err(CoalitionError::NoMember((*stranger).to_owned()));
+        if let Some(foreign) = members.iter().find(|name| !is_ours(name)) {
+            return Err(CoalitionError::NoMember((*foreign).to_owned()));
         }
         let parting = Members::new(members.iter().copied(), leader.map(Into::into))?;
         let stays = |name: &&Arc<str>| !members.contains(&&***name);

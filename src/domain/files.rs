@@ -228,8 +228,8 @@ impl DomainDir {
         if matches!(age, Ok(Ok(age)) if age < STALE) {
             return;
         }
-        let mut left = MAX_RENEWED;
-        renew_below(&path, MAX_DEPTH, &mut left);
+        let mut budget = MAX_RENEWED;
+        renew_below(&path, MAX_DEPTH, &mut budget);
         touch(&self.base, true);
         // Last, because this timestamp tells other processes that the renewal is complete.
         touch(&path, true);
@@ -469,16 +469,16 @@ fn not_writable(path: &Path, source: io::Error) -> DomainDirError {
 }
 
 /// Renews the timestamps of all files below a directory.
-fn renew_below(directory: &Path, depth: usize, left: &mut usize) {
+fn renew_below(directory: &Path, depth: usize, budget: &mut usize) {
     let found = fs::read_dir(directory).into_iter().flatten().flatten();
     for entry in found {
-        if *left == 0 {
+        if *budget == 0 {
             return;
         }
-        *left -= 1;
+        *budget -= 1;
         let path = entry.path();
         if depth > 0 && entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-            renew_below(&path, depth - 1, left);
+            renew_below(&path, depth - 1, budget);
         }
         // The modification time of a file with entries is its version.
         let is_versioned = path.extension().is_some_and(|end| end == "entries");

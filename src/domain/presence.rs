@@ -138,8 +138,8 @@ mod tests {
             if let Ok(asked) = read_question(content.as_bytes()) {
                 prop_assert!(read_question(&question(&asked)).is_ok_and(|again| again == asked));
             }
-            if let Ok(told) = read_answer(content.as_bytes()) {
-                prop_assert!(read_answer(&answer(told.clone())).is_ok_and(|again| again == told));
+            if let Ok(answered) = read_answer(content.as_bytes()) {
+                prop_assert!(read_answer(&answer(answered.clone())).is_ok_and(|again| again == answered));
             }
         }
     }
@@ -149,13 +149,13 @@ mod tests {
         let [a, b, c] = [1, 2, 3].map(Incarnation::from_u64);
         let asked = [Asked { id: a, mts: b }, Asked { id: b, mts: c }];
         assert_eq!(read_question(&question(&asked)).unwrap(), asked);
-        let told = Answer {
+        let answered = Answer {
             here: vec![a],
             gone: vec![b],
             unsupported: vec![c],
             version: VERSION,
         };
-        assert_eq!(read_answer(&answer(told.clone())).unwrap(), told);
+        assert_eq!(read_answer(&answer(answered.clone())).unwrap(), answered);
     }
 
     #[test]

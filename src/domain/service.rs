@@ -84,11 +84,11 @@ fn best(locations: Vec<Location>) -> Vec<Location> {
     let mut ranked: Vec<(usize, usize)> = ranks.zip(0..).collect();
     ranked.sort_unstable();
     ranked.truncate(Entry::MAX_LOCATIONS);
-    let kept = |place: &usize| ranked.iter().any(|(_, it)| it == place);
+    let is_ranked = |place: &usize| ranked.iter().any(|(_, it)| it == place);
     let places = 0..locations.len();
-    let kept: Vec<bool> = places.map(|place| kept(&place)).collect();
-    let all = locations.into_iter().zip(kept);
-    all.filter_map(|(location, kept)| kept.then_some(location))
+    let ranked_places: Vec<bool> = places.map(|place| is_ranked(&place)).collect();
+    let all = locations.into_iter().zip(ranked_places);
+    all.filter_map(|(location, is_ranked)| is_ranked.then_some(location))
         .collect()
 }
 
@@ -398,7 +398,7 @@ fn transports(
 ) -> Vec<Arc<dyn Transport>> {
     let mut transports: Vec<Arc<dyn Transport>> = Vec::new();
     for kind in used(config, role) {
-        let made = match kind {
+        let opened = match kind {
             #[cfg(feature = "shm")]
             Kind::Shm => shm(config, role, maintenance, incarnation, handle),
             Kind::Unix => unix(config, role, maintenance, incarnation, handle),
@@ -431,7 +431,7 @@ fn transports(
                 continue;
             }
         };
-        match made {
+        match opened {
             Ok(transport) => transports.push(transport),
             Err(error) => refused.push((kind, error)),
         }

@@ -269,7 +269,10 @@ impl Exchanging {
             } else if fault == TransportErrorKind::WrongIncarnation {
                 // The greeting makes the service that runs there now introduce itself.
                 let at = location.with_incarnation(Incarnation::UNKNOWN);
-                means.service.mts.greet(vec![(UNNAMED.into(), at)]);
+                means
+                    .service
+                    .mts
+                    .announce_locations(vec![(UNNAMED.into(), at)]);
             }
         }
         if let Some(announced) = announced {
@@ -367,7 +370,7 @@ impl Greetings {
                 continue;
             };
             let greetings = locations.map(|location| (Arc::clone(name), location.clone()));
-            means.service.mts.greet(greetings.collect());
+            means.service.mts.announce_locations(greetings.collect());
         }
     }
 
@@ -439,8 +442,8 @@ struct NameConflicts(HashMap<Incarnation, (Instant, bool)>);
 impl NameConflicts {
     /// Returns the time at which the next agent is to be informed.
     fn due(&self) -> Option<Instant> {
-        let untold = self.0.values().filter(|(_, told)| !told);
-        untold.map(|(since, _)| *since + CONTESTED).min()
+        let unreported = self.0.values().filter(|(_, reported)| !reported);
+        unreported.map(|(since, _)| *since + CONTESTED).min()
     }
 
     /// Informs each of these agents once that an agent of another host has its name.
@@ -450,9 +453,9 @@ impl NameConflicts {
             .retain(|agent, _| contested.iter().any(|one| one.entry.incarnation == *agent));
         for one in contested {
             let conflict = self.0.entry(one.entry.incarnation);
-            let (since, told) = conflict.or_insert((now, false));
-            if !*told && now >= *since + CONTESTED {
-                *told = true;
+            let (since, reported) = conflict.or_insert((now, false));
+            if !*reported && now >= *since + CONTESTED {
+                *reported = true;
                 one.report(means);
             }
         }
@@ -466,13 +469,13 @@ struct Disputes {
     /// By name and agent of the claimant that does not hold the name.
     all: HashMap<(Arc<str>, Incarnation), Dispute>,
     /// Time of the last report about a claim of each gateway.
-    told: HashMap<Incarnation, Instant>,
+    last_reports: HashMap<Incarnation, Instant>,
 }
 
 /// A name that agents of two other hosts claim.
 struct Dispute {
     since: Instant,
-    is_told: bool,
+    is_reported: bool,
     /// The gateway of the agent that claims the name but does not hold it.
     gateway: Incarnation,
     /// Whether the directory still shows it.
@@ -485,11 +488,12 @@ impl Disputes {
 
     /// Returns the time of the next report.
     fn due(&self) -> Option<Instant> {
-        let untold = self.all.values().filter(|dispute| !dispute.is_told);
-        untold
+        let unreported = self.all.values().filter(|dispute| !dispute.is_reported);
+        unreported
             .map(|dispute| {
-                let told = self.told.get(&dispute.gateway);
-                let free = told.map_or(dispute.since, |told| *told + Self::PAUSE);
+                let last_report = self.last_reports.get(&dispute.gateway);
+                let free =
+                    last_report.map_or(dispute.since, |last_report| *last_report + Self::PAUSE);
                 free.max(dispute.since + CONTESTED)
             })
             .min()
@@ -527,22 +531,23 @@ impl Disputes {
         for dispute in self.all.values_mut() {
             dispute.is_present = false;
         }
-        self.told.retain(|_, told| now < *told + Self::PAUSE);
+        self.last_reports
+            .retain(|_, last_report| now < *last_report + Self::PAUSE);
         let mut due = Vec::new();
         for (holder, other) in contested {
             let gateway = other.mts.incarnation;
             let key = (Arc::clone(&other.name), other.incarnation);
             let dispute = self.all.entry(key).or_insert(Dispute {
                 since: now,
-                is_told: false,
+                is_reported: false,
                 gateway,
                 is_present: true,
             });
             (dispute.gateway, dispute.is_present) = (gateway, true);
             let is_due = now >= dispute.since + CONTESTED;
-            if !dispute.is_told && is_due && !self.told.contains_key(&gateway) {
-                dispute.is_told = true;
-                self.told.insert(gateway, now);
+            if !dispute.is_reported && is_due && !self.last_reports.contains_key(&gateway) {
+                dispute.is_reported = true;
+                self.last_reports.insert(gateway, now);
                 due.push((Arc::clone(holder), Arc::clone(other)));
             }
         }
@@ -689,25 +694,25 @@ mod tests {
         let of = |name: &str, gateway| (agent(name, 1, 7), agent(name, 10 + gateway, gateway));
         // Gateway 8 claims three names, and gateway 9 one.
         let all = [of("a", 8), of("b", 8), of("c", 8), of("a", 9)];
-        let mut told = |ms, all: &[_]| {
+        let mut reports_at = |ms, all: &[_]| {
             let next = disputes.next(at(ms), all).into_iter();
             let names = next.map(|(_, other)| (other.name.to_string(), other.mts.incarnation));
             (names.collect::<Vec<_>>(), disputes.due())
         };
         let one = |name: &str, gateway| (name.to_owned(), Incarnation::from_u64(gateway));
         // The directory may show an agent that moves at two gateways for a moment.
-        assert_eq!(told(0, &all), (vec![], Some(at(1000))));
-        assert_eq!(told(999, &all), (vec![], Some(at(1000))));
+        assert_eq!(reports_at(0, &all), (vec![], Some(at(1000))));
+        assert_eq!(reports_at(999, &all), (vec![], Some(at(1000))));
         let first = vec![one("a", 8), one("a", 9)];
-        assert_eq!(told(1000, &all), (first, Some(at(2000))));
-        assert_eq!(told(1500, &all), (vec![], Some(at(2000))));
-        assert_eq!(told(2000, &all), (vec![one("b", 8)], Some(at(3000))));
-        assert_eq!(told(3000, &all), (vec![one("c", 8)], None));
-        assert_eq!(told(9000, &all), (vec![], None));
+        assert_eq!(reports_at(1000, &all), (first, Some(at(2000))));
+        assert_eq!(reports_at(1500, &all), (vec![], Some(at(2000))));
+        assert_eq!(reports_at(2000, &all), (vec![one("b", 8)], Some(at(3000))));
+        assert_eq!(reports_at(3000, &all), (vec![one("c", 8)], None));
+        assert_eq!(reports_at(9000, &all), (vec![], None));
         // A dispute that ended and began again is reported again.
-        assert_eq!(told(9000, &[]), (vec![], None));
-        assert_eq!(told(9000, &all[3..]), (vec![], Some(at(10_000))));
-        assert_eq!(told(10_000, &all[3..]), (vec![one("a", 9)], None));
+        assert_eq!(reports_at(9000, &[]), (vec![], None));
+        assert_eq!(reports_at(9000, &all[3..]), (vec![], Some(at(10_000))));
+        assert_eq!(reports_at(10_000, &all[3..]), (vec![one("a", 9)], None));
     }
 
     #[test]

@@ -19,17 +19,17 @@ const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// Logs the certificates that are not valid or expire soon.
 fn warn_about_expiry(credentials: &Credentials) {
     let now = SystemTime::now();
-    let told = |certificate, whose| {
+    let warning = |certificate, whose| {
         let holding = Holding::at(now, certificate);
-        Some((holding.told()?, holding.advice(now, whose)?))
+        Some((holding.problem()?, holding.advice(now, whose)?))
     };
-    if let Some((what, advice)) = told(&credentials.own, Whose::Own) {
+    if let Some((what, advice)) = warning(&credentials.own, Whose::Own) {
         log_limit::warn!(
             "the certificate of this host {what}; peers refuse a host without a valid certificate; {advice}"
         );
     }
     for trusted in &credentials.trusted {
-        if let Some((what, advice)) = told(trusted, Whose::Peer) {
+        if let Some((what, advice)) = warning(trusted, Whose::Peer) {
             let peer = trusted.certified().mts();
             log_limit::warn!("the certificate of {peer} {what}; {advice}");
         }
@@ -148,20 +148,20 @@ impl Guard {
         let (confirmed, _) = self.keys.confirmed();
         let count = confirmed.len();
         let revoked = self.keys.readable_revoked();
-        let kept = self.security.trust_only(confirmed, revoked);
+        let restricted = self.security.trust_only(confirmed, revoked);
         if self.fault.as_deref() == Some(error) {
             return;
         }
-        match kept {
+        match restricted {
             Ok(()) => log_limit::error!(
                 trusted = count,
                 "cannot use the changed keys: {error}; until this is repaired, only peers whose \
                  certificates can be read are trusted (see `fipa keys list`)"
             ),
-            Err(kept) => log_limit::error!(
+            Err(cause) => log_limit::error!(
                 "cannot use the changed keys: {error}; cannot restrict trust to the readable \
                  certificates: {}",
-                ErrorChain(&kept)
+                ErrorChain(&cause)
             ),
         }
     }

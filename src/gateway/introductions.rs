@@ -268,14 +268,19 @@ mod tests {
         assert!(unknown.reasons().contains("cannot be resolved"));
         takers.took(Instant::now(), &at("http://10.0.0.7:7778/acc"));
         let sender = at("http://10.0.0.7:7778/acc");
-        let heard =
-            contacts.heard_of_host(Instant::now(), "df@crex", sender.clone(), "crex.invalid");
-        heard.unwrap();
+        let first = contacts.record_sender_of_host(
+            Instant::now(),
+            "df@crex",
+            sender.clone(),
+            "crex.invalid",
+        );
+        first.unwrap();
         assert_eq!(judged(&grounds, stated).await.permitted, [sender]);
         // Another host claims the name.
         let other = at("http://10.0.0.66:7778/acc");
-        let heard = contacts.heard_of_host(Instant::now(), "x@crex", other, "crex.invalid");
-        heard.unwrap();
+        let second =
+            contacts.record_sender_of_host(Instant::now(), "x@crex", other, "crex.invalid");
+        second.unwrap();
         let contested = judged(&grounds, stated).await;
         assert!(contested.reasons().contains("several hosts"));
     }

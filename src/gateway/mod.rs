@@ -29,7 +29,7 @@ use fipa_acl::{ErrorChain, escape};
 use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
-    Cancellation, ContactDirectory, ContactError, Directory, Entry, Heard, MergedDirectory,
+    Cancellation, ContactChange, ContactDirectory, ContactError, Directory, Entry, MergedDirectory,
     RegisterError, Registration, Role as EntryRole, StaticDirectory, reserved_for,
 };
 use fipa_transport::{
@@ -111,7 +111,7 @@ impl Gateway {
         }
         let contacts = Arc::new(KnownPeers::default());
         let exchange = Arc::new(Exchanging::new(Incarnation::random().as_u64()));
-        let made = Mutex::new(None);
+        let directories = Mutex::new(None);
         let (refusals, refused_dials) = (Refusals::default(), RefusedDials::default());
         let service = Service::start(
             config,
@@ -138,13 +138,13 @@ impl Gateway {
                         all: MergedDirectory::new(vec![host, remote, contacted]),
                         neighbors: Arc::clone(&contacts.neighbors),
                     });
-                    *made.lock() = Some((network, known, Arc::clone(&view)));
+                    *directories.lock() = Some((network, known, Arc::clone(&view)));
                     Ok(view)
                 },
             },
             cancellation,
         )?;
-        let Some((network, known, view)) = made.into_inner() else {
+        let Some((network, known, view)) = directories.into_inner() else {
             return Err(OpenError::NoRuntime);
         };
         #[cfg(feature = "secure")]
@@ -506,7 +506,9 @@ async fn follow_locations(service: Arc<Service>, neighbors: Arc<Neighbors>) {
         if let Err(error) = registered.await.unwrap_or_else(|error| Err(error.into())) {
             log_limit::warn!(error = %ErrorChain(&error), "cannot update the gateway in the directory of this host");
         }
-        service.mts.greet(neighbors.to_greet(Instant::now()));
+        service
+            .mts
+            .announce_locations(neighbors.to_greet(Instant::now()));
     }
 }
 
@@ -627,7 +629,7 @@ struct KnownPeers {
     /// The platforms that have taken letters.
     takers: Takers,
     /// Number of new agents in the directory so far.
-    heard: AtomicU64,
+    recorded: AtomicU64,
     /// The number of them that are published. Locked while they are.
     published: Mutex<u64>,
 }
@@ -643,8 +645,8 @@ impl KnownPeers {
         host: Option<&str>,
     ) -> Result<(), ContactError> {
         self.record_with(name, agent, |directory| match host {
-            Some(host) => directory.heard_of_host(now, name, location, host),
-            None => directory.heard(now, name, agent, location),
+            Some(host) => directory.record_sender_of_host(now, name, location, host),
+            None => directory.record_sender(now, name, agent, location),
         })
     }
 
@@ -664,7 +666,7 @@ impl KnownPeers {
         &self,
         name: &str,
         agent: Incarnation,
-        record: impl FnOnce(&ContactDirectory) -> Result<Heard, ContactError>,
+        record: impl FnOnce(&ContactDirectory) -> Result<ContactChange, ContactError>,
     ) -> Result<(), ContactError> {
         // An agent of a platform without a gateway, such as JADE, must not pass for one of a gateway.
         if let Some(gateway) = reserved_for(name).filter(|_| !agent.is_known())
@@ -672,11 +674,11 @@ impl KnownPeers {
         {
             return Err(fipa_sds::EntryError::Reserved(gateway.to_owned()).into());
         }
-        let heard = record(&self.directory)?;
-        if heard.is_new {
-            self.heard.fetch_add(1, Ordering::AcqRel);
+        let change = record(&self.directory)?;
+        if change.is_new {
+            self.recorded.fetch_add(1, Ordering::AcqRel);
         }
-        if let Some(replaced) = heard.replaced {
+        if let Some(replaced) = change.replaced {
             let (agent, at) = (escape(&replaced.name), replaced.locations.first());
             let at = at.map(|at| escape(at.address()).into_owned());
             log_limit::info!(
@@ -690,14 +692,14 @@ impl KnownPeers {
 }
 
 impl Contacts for KnownPeers {
-    fn heard(&self, name: &str, agent: Incarnation, location: Location, host: Option<&str>) {
+    fn contact_seen(&self, name: &str, agent: Incarnation, location: Location, host: Option<&str>) {
         if let Err(error) = self.record(Instant::now(), name, agent, location, host) {
             log_limit::info!(error = %ErrorChain(&error), "cannot record the sender of a letter");
         }
     }
 
-    fn heard_again(&self, name: &str) {
-        self.directory.heard_again(Instant::now(), name);
+    fn contact_seen_again(&self, name: &str) {
+        self.directory.record_further_letter(Instant::now(), name);
     }
 
     fn took(&self, name: &str, location: &Location) {
@@ -707,17 +709,17 @@ impl Contacts for KnownPeers {
     }
 
     fn publish(&self) {
-        let wanted = self.heard.load(Ordering::Acquire);
+        let wanted = self.recorded.load(Ordering::Acquire);
         let mut published = self.published.lock();
         if *published >= wanted {
             return;
         }
-        let heard = self.heard.load(Ordering::Acquire);
+        let recorded = self.recorded.load(Ordering::Acquire);
         let publisher = self.publisher.lock().clone();
         if let Some(publisher) = publisher {
             publisher.publish_for_letter();
         }
-        *published = heard;
+        *published = recorded;
     }
 
     fn suspect(&self, location: &Location, fault: TransportErrorKind) {
@@ -731,7 +733,7 @@ impl Contacts for KnownPeers {
         self.neighbors.introduced(peer);
     }
 
-    fn parted(&self, peer: &Introduction) {
-        self.neighbors.parted(Instant::now(), peer);
+    fn disconnected(&self, peer: &Introduction) {
+        self.neighbors.disconnected(Instant::now(), peer);
     }
 }

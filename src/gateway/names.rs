@@ -94,9 +94,9 @@ mod tests {
             principal: Principal::Certificate([7; 32]),
         };
         exchange.handle_neighbors(Instant::now(), &[present]);
-        let told = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,
+        let announcement = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,
             "agents":[{"name":"rover","id":"0000000000000008","registered":1}]}}}"#;
-        let taken = exchange.handle_letter(Instant::now(), gateway, told);
+        let taken = exchange.handle_letter(Instant::now(), gateway, announcement);
         taken.unwrap();
         let known = MergedDirectory::new(vec![exchange.directory()]);
         let own = own_agents(&host);

@@ -44,15 +44,15 @@ struct State {
     /// Whether a neighbor with the same name was reported.
     has_namesake: bool,
     /// Neighbors whose last connection has ended, with the time of the end, the latest last.
-    parted: VecDeque<(Instant, Arc<Entry>)>,
+    disconnected: VecDeque<(Instant, Arc<Entry>)>,
 }
 
 /// Time for which a disconnected neighbor is still greeted when this host gets another address. The
 /// connections may have ended because this host lost its address, long before it gets another.
-const PARTED: Duration = Duration::from_secs(600);
+const STILL_GREETED: Duration = Duration::from_secs(600);
 
 /// Maximum number of disconnected neighbors that are stored.
-const MAX_PARTED: usize = 64;
+const MAX_DISCONNECTED: usize = 64;
 
 /// Maximum number of suspected locations that wait to be handled.
 const MAX_SUSPECTED: usize = 64;
@@ -208,7 +208,7 @@ impl Neighbors {
         state.present.insert(incarnation, neighbor);
         self.generation.fetch_add(1, Ordering::Release);
         state
-            .parted
+            .disconnected
             .retain(|(_, entry)| entry.incarnation != incarnation);
         if changed {
             self.changed.notify_one();
@@ -216,7 +216,7 @@ impl Neighbors {
     }
 
     /// Removes a connection of this peer that has ended.
-    pub(super) fn parted(&self, now: Instant, peer: &Introduction) {
+    pub(super) fn disconnected(&self, now: Instant, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
         let mut state = self.state.lock();
         let known = state.present.get_mut(&incarnation);
@@ -236,10 +236,10 @@ impl Neighbors {
             return;
         }
         if let Some(gone) = state.present.remove(&incarnation) {
-            if state.parted.len() >= MAX_PARTED {
-                state.parted.pop_front();
+            if state.disconnected.len() >= MAX_DISCONNECTED {
+                state.disconnected.pop_front();
             }
-            state.parted.push_back((now, gone.entry));
+            state.disconnected.push_back((now, gone.entry));
         }
         self.generation.fetch_add(1, Ordering::Release);
         self.changed.notify_one();
@@ -250,10 +250,12 @@ impl Neighbors {
     /// the connected ones, and those that were connected within the last [`PARTED`].
     pub(super) fn to_greet(&self, now: Instant) -> Vec<(Arc<str>, Location)> {
         let mut state = self.state.lock();
-        state.parted.retain(|(since, _)| *since + PARTED > now);
+        state
+            .disconnected
+            .retain(|(since, _)| *since + STILL_GREETED > now);
         let present = state.present.values().map(|neighbor| &neighbor.entry);
-        let parted = state.parted.iter().map(|(_, entry)| entry);
-        let all = present.chain(parted).flat_map(|entry| {
+        let recent = state.disconnected.iter().map(|(_, entry)| entry);
+        let all = present.chain(recent).flat_map(|entry| {
             // The transports race the locations of one kind, so one of each kind is enough.
             let mut kinds = Vec::new();
             let of_kind = entry.locations.iter().filter(move |location| {
@@ -519,11 +521,11 @@ mod tests {
         neighbors.introduced(&after);
         assert_eq!(locations(&neighbors), [at("10.0.0.3:1"), at("10.0.0.2:1")]);
         neighbors.introduced(&after);
-        neighbors.parted(now, &before);
-        neighbors.parted(now, &after);
+        neighbors.disconnected(now, &before);
+        neighbors.disconnected(now, &after);
         assert_eq!(locations(&neighbors), [at("10.0.0.3:1")]);
         assert_eq!(neighbors.all()[0].connections, 1);
-        neighbors.parted(now, &after);
+        neighbors.disconnected(now, &after);
         assert!(neighbors.all().is_empty());
     }
 
@@ -548,7 +550,7 @@ mod tests {
         let known = [at("10.0.0.2:1"), udp.with_incarnation(GATEWAY)];
         assert_eq!(locations(&neighbors), known);
         assert_eq!(neighbors.all()[0].peer.as_deref(), Some("crex"));
-        neighbors.parted(now, &dialed);
+        neighbors.disconnected(now, &dialed);
         assert_eq!(locations(&neighbors), known);
     }
 
@@ -579,8 +581,8 @@ mod tests {
         let greeted = vec![("crex-mts".into(), at("10.0.0.2:1"))];
         neighbors.introduced(&one);
         assert_eq!(neighbors.to_greet(now), greeted);
-        neighbors.parted(now, &one);
-        assert_eq!(neighbors.to_greet(now + PARTED / 2), greeted);
-        assert_eq!(neighbors.to_greet(now + PARTED), []);
+        neighbors.disconnected(now, &one);
+        assert_eq!(neighbors.to_greet(now + STILL_GREETED / 2), greeted);
+        assert_eq!(neighbors.to_greet(now + STILL_GREETED), []);
     }
 }

@@ -322,7 +322,7 @@ struct Task {
     remote_read: Option<Instant>,
     remote_due: Option<Instant>,
     /// The revision of the core that was kept last, and when.
-    kept: Option<(u64, Instant)>,
+    last_stored: Option<(u64, Instant)>,
 }
 
 impl Task {
@@ -348,7 +348,7 @@ impl Task {
             staying: HashSet::new(),
             remote_read: None,
             remote_due: None,
-            kept: None,
+            last_stored: None,
         };
         task.take_over();
         Some(task)
@@ -371,8 +371,8 @@ impl Task {
                 );
             }
             Core::Df(df) => {
-                let kept = (&from.descriptions[..], &from.subscriptions[..]);
-                df.take_over(now, from.elapsed, kept, stays);
+                let stored = (&from.descriptions[..], &from.subscriptions[..]);
+                df.take_over(now, from.elapsed, stored, stays);
             }
         }
         self.handle_departures();
@@ -386,15 +386,15 @@ impl Task {
             Core::Df(df) => df.revision(),
         };
         let now = Instant::now();
-        if let Some((kept, at)) = self.kept {
-            if kept == revision {
+        if let Some((stored, at)) = self.last_stored {
+            if stored == revision {
                 return None;
             }
             if now < at + KEEP_PAUSE {
                 return Some(at + KEEP_PAUSE);
             }
         }
-        self.kept = Some((revision, now));
+        self.last_stored = Some((revision, now));
         let state = &self.means.state;
         match &self.core {
             Core::Ams(ams) => state.set_agents(now, ams.keep(now)),
@@ -406,7 +406,8 @@ impl Task {
     /// Reads and answers letters until the service ends.
     async fn run(mut self) {
         let service = Arc::clone(&self.means.service);
-        let (mut here, mut there) = (service.host.watch(), self.means.known.watch());
+        let (mut local_changes, mut remote_changes) =
+            (service.host.watch(), self.means.known.watch());
         let mut locations = service.follow_locations();
         let exchanged = self.means.exchange.directory();
         let is_df = self.kind == Kind::Df;
@@ -431,20 +432,20 @@ impl Task {
                     let asked = self.second().map(|second| second.id.clone());
                     self.handle(&received, asked);
                 }
-                change = here.next() => {
+                change = local_changes.next() => {
                     if change.is_none() {
                         return;
                     }
                     // Several pending changes are handled together.
-                    while here.try_next().is_some() {}
+                    while local_changes.try_next().is_some() {}
                     self.handle_departures();
                     self.schedule_remote();
                 }
-                change = there.next() => {
+                change = remote_changes.next() => {
                     if change.is_none() {
                         return;
                     }
-                    while there.try_next().is_some() {}
+                    while remote_changes.try_next().is_some() {}
                     self.check_name();
                     self.schedule_remote();
                 }

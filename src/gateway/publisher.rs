@@ -69,7 +69,7 @@ impl Publisher {
     /// Publishes all agents of other hosts on this host.
     fn publish(&self) {
         let locations = self.service.locations();
-        let (heard, known) = (self.contacts.entries(), self.known.entries());
+        let (contacts, known) = (self.contacts.entries(), self.known.entries());
         let is_proved = |entry: &&Arc<Entry>| {
             let mandate = self.known.mandate(entry.mts.incarnation);
             mandate.is_proved()
@@ -77,7 +77,7 @@ impl Publisher {
         let (proved, unproved): (Vec<_>, Vec<_>) = known.iter().partition(is_proved);
         // The last entry holds a name and a registration: that of a directory, not of a contact, and a
         // proved one.
-        let all = heard.iter().chain(unproved).chain(proved);
+        let all = contacts.iter().chain(unproved).chain(proved);
         let through_here = all
             .filter(|entry| entry.role != Role::Gateway)
             .map(|entry| match self.is_unsupported(entry) {
@@ -130,8 +130,8 @@ impl PublishTask {
     pub(super) async fn run(mut self) {
         let publisher = Arc::clone(&self.publisher);
         let known = Arc::clone(&publisher.known);
-        let (mut here, mut there) = (publisher.host.watch(), known.watch());
-        let mut heard = publisher.contacts.watch();
+        let (mut local_changes, mut remote_changes) = (publisher.host.watch(), known.watch());
+        let mut contact_changes = publisher.contacts.watch();
         let mut located = publisher.service.follow_locations();
         if publisher.network.is_some() && publisher.announced_locations().is_empty() {
             log_limit::info!(
@@ -161,12 +161,12 @@ impl PublishTask {
             // Whether contacts are to be compared with the other agents of other hosts.
             let mut compare = None;
             let goes_on = tokio::select! {
-                change = here.next() => change.is_some(),
-                change = there.next() => {
+                change = local_changes.next() => change.is_some(),
+                change = remote_changes.next() => {
                     compare = Some(Instant::now());
                     change.is_some()
                 }
-                change = heard.next() => {
+                change = contact_changes.next() => {
                     compare = Some(Instant::now() + ContactDirectory::UNLISTED);
                     change.is_some()
                 }
@@ -182,8 +182,12 @@ impl PublishTask {
                 return;
             }
             // Several pending changes are handled together.
-            while heard.try_next().or_else(|| here.try_next()).is_some() {}
-            while there.try_next().is_some() {
+            while contact_changes
+                .try_next()
+                .or_else(|| local_changes.try_next())
+                .is_some()
+            {}
+            while remote_changes.try_next().is_some() {
                 compare = Some(Instant::now());
             }
             forget = match (forget, compare) {
@@ -233,8 +237,8 @@ impl PublishTask {
         });
         // One update for all, so that other hosts see the changes of a coalition together.
         let updated = network.update(&leaving, registrations.collect());
-        for ((name, _), left) in leaving.iter().zip(updated.left) {
-            if let Err(error) = left {
+        for ((name, _), result) in leaving.iter().zip(updated.removed) {
+            if let Err(error) = result {
                 tracing::debug!(name = %escape_name(name), error = %ErrorChain(&error), "cannot withdraw an announcement");
             }
         }

@@ -169,7 +169,7 @@ pub enum OwnError {
     },
     /// This agent owns the resource already.
     #[error("this agent owns {resource:?} already")]
-    Here {
+    AlreadyOwned {
         /// The resource.
         resource: String,
     },

@@ -104,7 +104,7 @@ impl Greetings {
     }
 
     /// Handles an agent that has left the directory.
-    pub(super) fn left(&mut self, agent: &LockPeer) {
+    pub(super) fn forget(&mut self, agent: &LockPeer) {
         self.known.remove(agent);
         self.waiting.remove(agent);
     }
@@ -275,7 +275,7 @@ mod tests {
             for number in 0..50 {
                 let one = agent("a", number);
                 count += usize::from(greetings.announced(now, &peer(1), &one));
-                greetings.left(&one);
+                greetings.forget(&one);
             }
         }
         assert!(count <= 256 + 20 * 10 + 1, "{count}");

@@ -162,7 +162,7 @@ impl Owned {
         let shared = shell::start(&core)?;
         let Some(mut holding) = shared.reserve(&resource) else {
             let resource = resource.as_str().to_owned();
-            return Err(OwnError::Here { resource });
+            return Err(OwnError::AlreadyOwned { resource });
         };
         let mut owned = Self {
             core,

@@ -49,14 +49,14 @@ const UNREPEATED: Duration = Duration::from_secs(600);
 
 /// Sets the options of an agent's locks, and starts them.
 pub(super) fn set(core: &Arc<AgentCore>, options: LockOptions) -> Result<(), LockError> {
-    let (kind, legacy_peers) = (options.algorithm, options.legacy_peers);
+    let (algorithm, legacy_peers) = (options.algorithm, options.legacy_peers);
     let options = options.core();
     options.check()?;
     let mut slot = core.locks.0.lock();
     if slot.running.is_some() {
         return Err(LockError::Started);
     }
-    slot.options = Some((kind, options));
+    slot.options = Some((algorithm, options));
     slot.legacy_peers = legacy_peers;
     drop(slot);
     start(core).map(drop)
@@ -86,12 +86,12 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
     let me = LockPeer::new(&endpoint.name, endpoint.incarnation.as_u64())?;
     let runtime = &endpoint.domain.inner.service.runtime;
     let timer = Timer::new(runtime).map_err(LockError::Timer)?;
-    let (kind, mut options) = slot.options.unwrap_or_default();
+    let (algorithm, mut options) = slot.options.unwrap_or_default();
     let legacy_peers = slot.legacy_peers;
     // A later registration of the name begins its conversations with higher numbers.
     let time = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     options.first_conversation = millis(time.unwrap_or_default());
-    let mut locks = Locks::new(me.clone(), kind, options);
+    let mut locks = Locks::new(me.clone(), algorithm, options);
     // Before the first request, so that it waits for the answers to the greetings.
     let directory = endpoint.domain.directory();
     directory.refresh();
@@ -106,7 +106,7 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
         state: Mutex::new(State::new(locks)),
         sending: Mutex::new(()),
         changed: Notify::new(),
-        kind,
+        algorithm,
     });
     slot.running = Some(Arc::clone(&shared) as Arc<dyn RunningLocks>);
     drop(slot);
@@ -158,7 +158,7 @@ pub(super) struct Shared {
     sending: Mutex<()>,
     /// Wakes the task after a change of the next timeout.
     changed: Notify,
-    kind: Algorithm,
+    algorithm: Algorithm,
 }
 
 struct State {
@@ -354,15 +354,15 @@ impl Shared {
 
     fn send(&self, core: &AgentCore, to: &LockPeer, message: &LockMessage) {
         let endpoint = &core.endpoint;
-        let message_kind = message.algorithm.unwrap_or(self.kind);
+        let algorithm = message.algorithm.unwrap_or(self.algorithm);
         let sent = AgentId::new(to.name())
             .map_err(|error| error.to_string())
             .and_then(|receiver| {
-                let message = codec::encode(message, self.kind, &endpoint.id, &receiver);
+                let message = codec::encode(message, self.algorithm, &endpoint.id, &receiver);
                 let message = message.map_err(|error| error.to_string())?;
                 let letter = letter_for(&message, SystemTime::now());
                 let mut deadline = endpoint.domain.inner.deadline;
-                if !message_kind.is_extended() {
+                if !algorithm.is_extended() {
                     deadline = deadline.max(UNREPEATED);
                 }
                 let sending = endpoint.send(&message, letter, deadline);
@@ -609,7 +609,7 @@ struct Task {
 
 impl Task {
     async fn run(mut self) {
-        self.greet_all();
+        self.probe_all();
         let ended = self.serve().await;
         if let Err(error) = ended {
             log_limit::error!(%error, "the locks of an agent have ended");
@@ -664,7 +664,7 @@ impl Task {
                     None => self.changes = None,
                 },
                 () = self.shared.changed.notified() => {}
-                () = until(greets) => self.greet_due(),
+                () = until(greets) => self.probe_due(),
             }
         }
     }
@@ -773,31 +773,31 @@ impl Task {
     fn handle_change(&mut self, change: &Change) {
         for change in change.single() {
             match change {
-                Change::Joined(entry) => self.greet(entry),
+                Change::Joined(entry) => self.probe_new(entry),
                 Change::Changed { before, after } => {
                     if before.incarnation != after.incarnation {
-                        self.left(before);
+                        self.forget(before);
                     }
-                    self.greet(after);
+                    self.probe_new(after);
                 }
-                Change::Left(entry) => self.left(entry),
-                _ => self.greet_all(),
+                Change::Left(entry) => self.forget(entry),
+                _ => self.probe_all(),
             }
         }
     }
 
     /// Greets the agents in the directory that were not greeted, and forgets those that are not in it.
-    fn greet_all(&mut self) {
+    fn probe_all(&mut self) {
         let entries = self.core.endpoint.domain.directory().entries();
         let present: HashSet<LockPeer> = entries.iter().filter_map(|it| peer_of(it)).collect();
         self.greetings.retain(|agent| present.contains(agent));
         for entry in entries.iter() {
-            self.greet(entry);
+            self.probe_new(entry);
         }
     }
 
     /// Asks an agent for a sign of life, or has it wait. One that uses locks answers, and becomes a member.
-    fn greet(&mut self, entry: &Entry) {
+    fn probe_new(&mut self, entry: &Entry) {
         if is_greeted(&self.core, self.greets_legacy_peers, entry)
             && let Some(agent) = peer_of(entry)
             && self
@@ -808,20 +808,20 @@ impl Task {
         }
     }
 
-    fn left(&mut self, entry: &Entry) {
+    fn forget(&mut self, entry: &Entry) {
         if let Some(agent) = peer_of(entry) {
-            self.greetings.left(&agent);
+            self.greetings.forget(&agent);
         }
     }
 
     /// Greets the agents that have waited.
-    fn greet_due(&mut self) {
+    fn probe_due(&mut self) {
         let now = Instant::now();
         for agent in self.greetings.due(now) {
             self.ask(agent);
         }
         if self.greetings.reads_again(now) {
-            self.greet_all();
+            self.probe_all();
         }
     }
 

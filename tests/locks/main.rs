@@ -562,7 +562,10 @@ async fn an_owner_needs_its_state_file_and_its_resource() {
         // The time of day.
         assert!(lock.fence().unwrap().epoch() > 1_000_000_000);
         let again = crane.own("bay", kept(&files, FOREVER)).await;
-        assert!(matches!(again, Err(OwnError::Here { .. })), "{again:?}");
+        assert!(
+            matches!(again, Err(OwnError::AlreadyOwned { .. })),
+            "{again:?}"
+        );
         let other = agent(&there, "arm").await;
         let taken = other.own("bay", kept(&files, FOREVER)).await;
         assert!(

@@ -363,8 +363,13 @@ fn main() {
     };
     let transport = UdtTransport::new(config, runtime.handle().clone());
     let sink = Arc::new(Counter::default());
-    let here = transport.listen(sink.clone()).unwrap();
-    let port = here[0].address().rsplit_once(':').unwrap().1.to_owned();
+    let locations = transport.listen(sink.clone()).unwrap();
+    let port = locations[0]
+        .address()
+        .rsplit_once(':')
+        .unwrap()
+        .1
+        .to_owned();
     let side = Side {
         transport,
         sink,
@@ -398,8 +403,8 @@ fn main() {
             back.receiver / limit.receiver,
             ours / theirs,
         ];
-        for (kept, now) in ratios.iter_mut().zip(now) {
-            kept.push(now);
+        for (all, now) in ratios.iter_mut().zip(now) {
+            all.push(now);
         }
     }
     println!("median of {rounds} rounds, as a ratio to libudt (smallest to largest)");

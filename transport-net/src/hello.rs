@@ -80,9 +80,9 @@ impl Hello {
         for text in [name, domain, host, &self.dialed] {
             put_text(&mut out, text);
         }
-        let told = self.listening.iter().take(MAX_LISTENING);
-        out.put_u8(told.len() as u8);
-        told.for_each(|text| put_text(&mut out, text));
+        let listening = self.listening.iter().take(MAX_LISTENING);
+        out.put_u8(listening.len() as u8);
+        listening.for_each(|text| put_text(&mut out, text));
         if self.load == Load::Large {
             out.put_u8(LARGE);
         }

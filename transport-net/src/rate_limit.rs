@@ -31,11 +31,11 @@ pub(crate) struct PeerRateLimits(Mutex<HashMap<IpAddr, Arc<PeerRateLimit>>>);
 pub(crate) struct PeerRateLimit {
     letters_per_second: f64,
     bytes_per_second: f64,
-    left: Mutex<Left>,
+    buckets: Mutex<Buckets>,
 }
 
 #[derive(Debug)]
-struct Left {
+struct Buckets {
     letters: TokenBucket,
     bytes: TokenBucket,
 }
@@ -76,7 +76,7 @@ impl PeerRateLimit {
         Self {
             letters_per_second: letters,
             bytes_per_second: bytes,
-            left: Mutex::new(Left {
+            buckets: Mutex::new(Buckets {
                 letters: TokenBucket::new(letters, now),
                 bytes: TokenBucket::new(bytes, now),
             }),
@@ -86,15 +86,15 @@ impl PeerRateLimit {
     /// Charges received letters and bytes. Returns the time until which nothing more is to be read,
     /// if any: at most a second from now, so that pings are read in time.
     pub(crate) fn spend(&self, letters: u64, bytes: usize, now: Instant) -> Option<Instant> {
-        let mut left = self.left.lock();
+        let mut buckets = self.buckets.lock();
         let spent = [
             (letters as f64, self.letters_per_second),
             (bytes as f64, self.bytes_per_second),
         ];
-        let Left {
+        let Buckets {
             letters: few,
             bytes: small,
-        } = &mut *left;
+        } = &mut *buckets;
         let pauses = [few, small].into_iter().zip(spent);
         let pauses = pauses.filter_map(|(allowance, (amount, rate))| {
             // An unlimited rate never causes a pause.
@@ -105,8 +105,8 @@ impl PeerRateLimit {
     }
 
     fn is_full(&self, now: Instant) -> bool {
-        let left = self.left.lock();
-        let asked = left.letters.asked().max(left.bytes.asked());
+        let buckets = self.buckets.lock();
+        let asked = buckets.letters.asked().max(buckets.bytes.asked());
         now.saturating_duration_since(asked) >= Duration::from_secs(2)
     }
 }

@@ -90,18 +90,18 @@ fn a_peer_that_meets_all_requirements_is_admitted() {
 #[test]
 fn tls_1_2_is_refused() {
     let to = Trusting::new();
-    let told = greet_tls(client(Some(&to.rogue), ONLY_12), to.tcp_at()).unwrap_err();
-    assert!(told.contains("ProtocolVersion"), "{told}");
+    let error = greet_tls(client(Some(&to.rogue), ONLY_12), to.tcp_at()).unwrap_err();
+    assert!(error.contains("ProtocolVersion"), "{error}");
     to.assert_nothing_came();
     // Nor does this side use it when it dials.
-    let (at, heard) = hear_tls(server(&to.rogue, ONLY_12));
+    let (at, received) = hear_tls(server(&to.rogue, ONLY_12));
     assert_not_sent(&to.tcp, Kind::Tcp, &at.to_string());
-    heard.join().unwrap().unwrap_err();
+    received.join().unwrap().unwrap_err();
     // A peer with TLS 1.3 is admitted.
-    let (at, heard) = hear_tls(server(&to.rogue, ONLY_13));
+    let (at, received) = hear_tls(server(&to.rogue, ONLY_13));
     let at = Location::new(Kind::Tcp, &at.to_string()).unwrap();
     to.tcp.send(2, &at, parcel(2, "hello")).unwrap();
-    assert!(heard.join().unwrap().unwrap().starts_with(b"fipa"));
+    assert!(received.join().unwrap().unwrap().starts_with(b"fipa"));
 }
 
 #[test]
@@ -126,9 +126,9 @@ fn another_protocol_over_quic_is_refused() {
     let own = client(Some(&to.rogue), ONLY_13);
     for protocol in [&b"h3"[..], b"fipa/0"] {
         let config = quic(own.clone(), protocol, VERSION);
-        let told = greet_quic(config, to.quic_at()).unwrap_err();
+        let error = greet_quic(config, to.quic_at()).unwrap_err();
         // No application protocol (RFC 7301 section 3.2).
-        assert!(told.contains("error 120"), "{told}");
+        assert!(error.contains("error 120"), "{error}");
     }
     to.assert_nothing_came();
     // Nor is a listener for another protocol accepted.
@@ -141,17 +141,17 @@ fn another_protocol_over_quic_is_refused() {
             assert!(incoming.await.is_err());
         }
     });
-    let told = assert_not_sent(&to.quic, Kind::Quic, &at);
+    let error = assert_not_sent(&to.quic, Kind::Quic, &at);
     // No application protocol (RFC 7301 section 3.2).
-    assert!(told.contains("error 120"), "{told}");
+    assert!(error.contains("error 120"), "{error}");
 }
 
 #[test]
 fn other_versions_of_quic_are_refused() {
     let to = Trusting::new();
     let own = client(Some(&to.rogue), ONLY_13);
-    let told = greet_quic(quic(own, PROTOCOL, DRAFT), to.quic_at()).unwrap_err();
-    assert!(told.contains("version"), "{told}");
+    let error = greet_quic(quic(own, PROTOCOL, DRAFT), to.quic_at()).unwrap_err();
+    assert!(error.contains("version"), "{error}");
     to.assert_nothing_came();
     // An unknown version only gets the list of supported versions (RFC 9000 section 6.1).
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -179,15 +179,15 @@ fn a_listener_without_tls_gets_only_a_client_hello() {
         stream
             .write_all(&frame(1, 0, &hello_of(ROGUE, 77)))
             .unwrap();
-        let mut heard = Vec::new();
+        let mut received = Vec::new();
         // A reset is equivalent to an end of stream.
-        let _ = stream.read_to_end(&mut heard);
+        let _ = stream.read_to_end(&mut received);
         listener.set_nonblocking(true).unwrap();
-        (heard, listener.accept().is_ok())
+        (received, listener.accept().is_ok())
     });
     assert_not_sent(&to.tcp, Kind::Tcp, &at);
-    let (heard, came_again) = listening.join().unwrap();
-    assert_eq!(heard.first(), Some(&22), "no TLS record");
+    let (received, came_again) = listening.join().unwrap();
+    assert_eq!(received.first(), Some(&22), "no TLS record");
     for word in [
         &b"fipa"[..],
         NAME.as_bytes(),
@@ -195,7 +195,7 @@ fn a_listener_without_tls_gets_only_a_client_hello() {
         b"arm_1",
         b"envelope",
     ] {
-        let is_there = heard.windows(word.len()).any(|part| part == word);
+        let is_there = received.windows(word.len()).any(|part| part == word);
         assert!(
             !is_there,
             "{:?} in the clear",

@@ -253,12 +253,12 @@ fn inside_beyond_the_bounds_the_newest_connection_is_reset_and_its_sender_sees_i
     }
     for number in 1..=20 {
         let mut stream = gateway.connect_from(HERE);
-        let told = stream
+        let error = stream
             .write_all(&letter(number, 0))
             .and_then(|()| stream.read(&mut [0]));
-        let told = told.unwrap_err().kind();
+        let error = error.unwrap_err().kind();
         let reset = [ErrorKind::ConnectionReset, ErrorKind::BrokenPipe];
-        assert!(reset.contains(&told), "{told}");
+        assert!(reset.contains(&error), "{error}");
         until_some("the count", || {
             (gateway.refused_crowd() == number).then_some(())
         });

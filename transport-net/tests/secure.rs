@@ -115,16 +115,16 @@ fn assert_refused<T: Transport>(from: &Party<T>, to: &Party<T>) -> String {
 }
 
 /// Asserts that an error names the alert of the peer once, and does not guess about keys.
-fn assert_tells_alert(told: &str, alert: &str) {
+fn assert_tells_alert(error_text: &str, alert: &str) {
     let part = format!("the peer sent the TLS alert {alert}");
-    assert_eq!(told.matches(&part).count(), 1, "{told}");
+    assert_eq!(error_text.matches(&part).count(), 1, "{error_text}");
     for guess in [
         "possible causes",
         "has none",
         "security.keys",
         "may require",
     ] {
-        assert!(!told.contains(guess), "{told}");
+        assert!(!error_text.contains(guess), "{error_text}");
     }
 }
 
@@ -178,16 +178,19 @@ fn untrusted_peers_are_refused_on_either_side<T: Proving>() {
     // This certificate is not trusted.
     let to = T::party(crex.security(&[&rover]));
     let from = T::party(stranger.security(&[&crex]));
-    let told = assert_refused(&from, &to);
-    assert!(told.contains("the peer does not trust this host"), "{told}");
-    assert_tells_alert(&told, "unknown_ca (48)");
+    let error_text = assert_refused(&from, &to);
+    assert!(
+        error_text.contains("the peer does not trust this host"),
+        "{error_text}"
+    );
+    assert_tells_alert(&error_text, "unknown_ca (48)");
     // The listener has another certificate.
     let from = T::party(rover.security(&[&stranger]));
-    let told = assert_refused(&from, &to);
-    assert!(told.contains("unknown issuer"), "{told}");
+    let error_text = assert_refused(&from, &to);
+    assert!(error_text.contains("unknown issuer"), "{error_text}");
     assert!(
-        told.contains("does not trust the peer: run `fipa keys trust`"),
-        "{told}"
+        error_text.contains("does not trust the peer: run `fipa keys trust`"),
+        "{error_text}"
     );
     until_some("it was counted", || {
         (to.transport.counters().refused_unproved >= 2).then_some(())
@@ -204,24 +207,34 @@ fn certificates_that_are_not_valid_now_are_refused<T: Proving>() {
     ] {
         let crex = Host::valid(NAME, &[], from, until);
         let (from, to) = friends::<T>(&rover, &crex);
-        let told = assert_refused(&from, &to);
+        let error_text = assert_refused(&from, &to);
         assert!(
-            told.contains(what) && told.contains("renew` there"),
-            "{told}"
+            error_text.contains(what) && error_text.contains("renew` there"),
+            "{error_text}"
         );
-        let clock = told.contains("not valid yet by the clock of this host");
-        assert_eq!(clock, what == "not valid yet", "{told}");
+        let clock = error_text.contains("not valid yet by the clock of this host");
+        assert_eq!(clock, what == "not valid yet", "{error_text}");
         // The clock comes before the keys.
-        let shown = told.find("the clock of this host, which shows 20").unwrap();
-        assert!(shown < told.find("renew` there").unwrap(), "{told}");
-        let told = assert_refused(&to, &from);
+        let shown = error_text
+            .find("the clock of this host, which shows 20")
+            .unwrap();
         assert!(
-            told.contains("this host's certificate is not valid"),
-            "{told}"
+            shown < error_text.find("renew` there").unwrap(),
+            "{error_text}"
         );
-        assert_tells_alert(&told, "certificate_expired (45)");
-        let shown = told.find("the clock of this host, which shows 20").unwrap();
-        assert!(shown < told.find("keys renew`").unwrap(), "{told}");
+        let error_text = assert_refused(&to, &from);
+        assert!(
+            error_text.contains("this host's certificate is not valid"),
+            "{error_text}"
+        );
+        assert_tells_alert(&error_text, "certificate_expired (45)");
+        let shown = error_text
+            .find("the clock of this host, which shows 20")
+            .unwrap();
+        assert!(
+            shown < error_text.find("keys renew`").unwrap(),
+            "{error_text}"
+        );
     }
 }
 
@@ -240,8 +253,8 @@ fn a_certificate_without_its_key_is_of_no_use() {
 fn a_peer_cannot_claim_another_name_than_its_certificate_has<T: Proving>() {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new("another-mts", &[]));
     let (from, to) = friends::<T>(&rover, &crex);
-    let told = assert_refused(&from, &to);
-    assert!(told.contains("another-mts"), "{told}");
+    let error_text = assert_refused(&from, &to);
+    assert!(error_text.contains("another-mts"), "{error_text}");
 }
 
 /// The service may be connected over another transport, with another certificate.
@@ -384,10 +397,16 @@ fn a_peer_that_must_prove_its_identity_gets_no_unencrypted_bytes() {
     let to = party(crex.security(&[&rover]));
     // A fipa peer without keys, in both directions.
     let plain = Party::new();
-    let told = assert_refused(&plain, &to);
-    assert!(told.contains("set security.keys here"), "{told}");
-    let told = assert_refused(&to, &plain);
-    assert!(told.contains("set security.keys there"), "{told}");
+    let error_text = assert_refused(&plain, &to);
+    assert!(
+        error_text.contains("set security.keys here"),
+        "{error_text}"
+    );
+    let error_text = assert_refused(&to, &plain);
+    assert!(
+        error_text.contains("set security.keys there"),
+        "{error_text}"
+    );
     // A legacy peer's letter, and frames.
     for first in [&b"\xfe\x10"[..], b"fipa\x03\x01\0\0", b"<?xml", b"garbage"] {
         let address = to.location().address().to_owned();
@@ -619,8 +638,8 @@ fn each_alert_is_told_with_its_own_remedy() {
     let Conclusion::NotSent(error) = from.conclusion(100) else {
         panic!("{:?}", from.conclusion(100));
     };
-    let told = "alert certificate_required (116): the peer requires a certificate";
-    assert!(error.detail.contains(told), "{error}");
+    let error_text = "alert certificate_required (116): the peer requires a certificate";
+    assert!(error.detail.contains(error_text), "{error}");
 }
 
 #[test]

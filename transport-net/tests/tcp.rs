@@ -155,11 +155,11 @@ fn another_host_or_domain_is_remote() {
 #[test]
 fn a_peer_that_repeats_host_and_domain_is_remote_unless_loopback_is_listed() {
     for (listed, is_remote) in [(true, false), (false, true)] {
-        let mut here = config(&["127.0.0.1:0"]);
-        here.processes = listed;
-        let here = Party::with(here);
-        Party::new().assert_reaches(1, &here);
-        assert_eq!(here.sink.record.lock().arrivals[0].1.is_remote(), is_remote);
+        let mut near = config(&["127.0.0.1:0"]);
+        near.processes = listed;
+        let near = Party::with(near);
+        Party::new().assert_reaches(1, &near);
+        assert_eq!(near.sink.record.lock().arrivals[0].1.is_remote(), is_remote);
     }
 }
 
@@ -355,11 +355,11 @@ fn silent() -> (socket2::Socket, TcpStream, String) {
 fn the_addresses_of_a_service_are_raced_without_duplicating_letters() {
     let (near, far, other) = (Party::new(), Party::new(), Party::new());
     let (_full, _first, silent) = silent();
-    let here = far.location();
+    let working = far.location();
     let to = Location::new(Kind::Tcp, &silent).unwrap();
-    let to = to.with_incarnation(here.incarnation());
+    let to = to.with_incarnation(working.incarnation());
     // Addresses of other services are not tried.
-    *near.sink.also_at.lock() = vec![other.location().clone(), here.clone()];
+    *near.sink.also_at.lock() = vec![other.location().clone(), working.clone()];
     for attempt in 0..20 {
         near.send(attempt, &to, parcel(attempt + 1, "x")).unwrap();
     }

@@ -58,7 +58,7 @@ impl Party {
 }
 
 /// The socket of an unproved peer, connected to an endpoint.
-fn stranger(to: &Party) -> UdpSocket {
+fn unknown_peer(to: &Party) -> UdpSocket {
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     socket.connect(to.location.address()).unwrap();
     socket
@@ -98,7 +98,7 @@ fn a_name_resolves_to_the_address_that_answers() {
 fn a_flood_of_garbage_blocks_no_peer_and_leaves_no_state() {
     let (near, far) = (Party::new(), Party::new());
     near.assert_reaches(0, &far.location);
-    let socket = stranger(&far);
+    let socket = unknown_peer(&far);
     let mut random = fastrand::Rng::with_seed(1);
     for round in 1..=50 {
         for _ in 0..400 {
@@ -120,7 +120,7 @@ fn a_flood_of_garbage_blocks_no_peer_and_leaves_no_state() {
 #[test]
 fn hellos_without_a_cookie_take_no_memory_and_get_little() {
     let (near, far) = (Party::new(), Party::new());
-    let socket = stranger(&far);
+    let socket = unknown_peer(&far);
     let mut replies = 0;
     let mut reply = [0; 2048];
     for number in 1..=2000_u64 {
@@ -138,7 +138,7 @@ fn hellos_without_a_cookie_take_no_memory_and_get_little() {
 
 /// Opens a connection as a hostile peer. Returns it with its number at the other side.
 fn introduced(to: &Party, incarnation: u64) -> (UdpSocket, u64) {
-    let socket = stranger(to);
+    let socket = unknown_peer(to);
     let mut reply = [0; 2048];
     socket.send(&hello(1, [0; 16])).unwrap();
     socket.recv(&mut reply).unwrap();

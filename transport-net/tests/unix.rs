@@ -228,8 +228,8 @@ fn assert_process_ended(directory: &Path, to: &str) {
     let Conclusion::NotSent(error) = from.conclusion(1) else {
         panic!("{:?}", from.conclusion(1));
     };
-    let told = "the process at this socket has ended or is ending";
-    assert!(error.detail.contains(told), "{error}");
+    let text = "the process at this socket has ended or is ending";
+    assert!(error.detail.contains(text), "{error}");
     assert!(!error.detail.contains("keys"), "{error}");
     from.assert_reaches(2, &party(directory));
 }

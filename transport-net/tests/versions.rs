@@ -132,8 +132,8 @@ fn the_sender_learns_which_version_the_peer_answered_with() {
         let at = listener.local_addr().unwrap().to_string();
         let peer = std::thread::spawn(move || {
             let (mut stream, _) = listener.accept().unwrap();
-            let mut heard = [0; 8];
-            stream.read_exact(&mut heard).unwrap();
+            let mut received = [0; 8];
+            stream.read_exact(&mut received).unwrap();
             let said = match version {
                 9 => hello(version)[..8].to_vec(),
                 _ => hello(version),
@@ -142,14 +142,14 @@ fn the_sender_learns_which_version_the_peer_answered_with() {
             // Until the other side closes the connection.
             let mut rest = Vec::new();
             let _ = stream.read_to_end(&mut rest);
-            heard
+            received
         });
         let to = Location::new(Kind::Tcp, &at).unwrap();
         let error = not_sent(&from, attempt, &to);
         assert_eq!(error.fault, TransportErrorKind::Incompatible, "{error}");
         assert_names_versions(&error.to_string(), version);
-        let heard = peer.join().unwrap();
-        assert_eq!(heard[..6], *b"fipa\x03\x01", "the hello of this side");
+        let received = peer.join().unwrap();
+        assert_eq!(received[..6], *b"fipa\x03\x01", "the hello of this side");
     }
 }
 
@@ -183,12 +183,12 @@ fn versions_are_told_over_tls() {
     assert_tells_its_version(&answer);
     assert_listed(&refusals, 9);
 
-    let (at, heard) = answer_tls(server(&rogue, ONLY_13), hello(1));
+    let (at, received) = answer_tls(server(&rogue, ONLY_13), hello(1));
     let to = Location::new(Kind::Tcp, &at.to_string()).unwrap();
     let error = not_sent(&party, 1, &to);
     assert_eq!(error.fault, TransportErrorKind::Incompatible, "{error}");
     assert_names_versions(&error.to_string(), 1);
-    assert!(heard.join().unwrap().unwrap().starts_with(b"fipa\x03"));
+    assert!(received.join().unwrap().unwrap().starts_with(b"fipa\x03"));
 }
 
 #[test]

@@ -242,7 +242,7 @@ impl Outbox {
             chunks: 2 * places + most_loans,
             state: Mutex::default(),
             waiting: UnansweredCount {
-                here: AtomicUsize::new(0),
+                of_peer: AtomicUsize::new(0),
                 of_all: opening.waiting,
             },
             loans: AtomicUsize::new(0),
@@ -264,7 +264,7 @@ impl Outbox {
 
     /// Number of unanswered parcels.
     pub(crate) fn waiting(&self) -> usize {
-        self.waiting.here.load(Ordering::Acquire)
+        self.waiting.of_peer.load(Ordering::Acquire)
     }
 
     /// Whether the outbox can be closed without losing anything.
@@ -454,11 +454,16 @@ impl Outbox {
         state: &State,
         loan: &Loan,
     ) -> Result<Option<UninitRequest>, TransportError> {
-        let kept = |loan: &Weak<Loan>| {
+        let is_in_use = |loan: &Weak<Loan>| {
             loan.upgrade()
                 .is_some_and(|loan| loan.is_kept_after_sending())
         };
-        let active = state.queue.len() + state.loans.iter().filter(|(_, loan)| kept(loan)).count();
+        let active = state.queue.len()
+            + state
+                .loans
+                .iter()
+                .filter(|(_, loan)| is_in_use(loan))
+                .count();
         if active >= self.letters {
             return Err(window_full(active));
         }
@@ -750,7 +755,7 @@ impl From<Conclusion> for End {
 /// Number of unanswered parcels.
 #[derive(Debug)]
 struct UnansweredCount {
-    here: AtomicUsize,
+    of_peer: AtomicUsize,
     of_all: Arc<AtomicUsize>,
 }
 
@@ -772,13 +777,13 @@ impl Drop for UnansweredGuard<'_> {
 
 impl UnansweredCount {
     fn increment(&self) -> UnansweredGuard<'_> {
-        self.here.fetch_add(1, Ordering::AcqRel);
+        self.of_peer.fetch_add(1, Ordering::AcqRel);
         self.of_all.fetch_add(1, Ordering::AcqRel);
         UnansweredGuard(self)
     }
 
     fn decrement(&self) {
-        self.here.fetch_sub(1, Ordering::AcqRel);
+        self.of_peer.fetch_sub(1, Ordering::AcqRel);
         self.of_all.fetch_sub(1, Ordering::AcqRel);
     }
 }

@@ -130,9 +130,9 @@ impl Pool {
         // open.
         static LAST_NUMBER: AtomicU64 = AtomicU64::new(0);
         let number = LAST_NUMBER.fetch_add(1, Ordering::Relaxed) + 1;
-        let made = self.make_file(number, room);
+        let created = self.make_file(number, room);
         drop(lock);
-        let (file, generation) = made.inspect_err(|_| self.remove(number))?;
+        let (file, generation) = created.inspect_err(|_| self.remove(number))?;
         let segment = Arc::new(Segment { number, file });
         state.slots.push(Slot {
             segment: Arc::clone(&segment),

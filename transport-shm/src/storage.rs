@@ -299,7 +299,7 @@ impl<'builder, T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool>
             match self.make() {
                 // Another process was faster.
                 Err(DynamicStorageCreateError::AlreadyExists) => {}
-                made => return Ok(made?),
+                created => return Ok(created?),
             }
         }
     }
@@ -461,8 +461,8 @@ pub(crate) struct Shortage {
 /// that reason, and creates a port without its connections if there is no room for them.
 pub(crate) fn with_shortage<R>(make: impl FnOnce() -> R) -> (R, Option<Shortage>) {
     LAST_SHORTAGE.set(None);
-    let made = make();
-    (made, LAST_SHORTAGE.take())
+    let result = make();
+    (result, LAST_SHORTAGE.take())
 }
 
 /// The mapped sparse files of this process, by the address of the mapping.
@@ -621,8 +621,11 @@ mod tests {
         let builder = Builder::<u64, false>::new(&name)
             .supplementary_size(usize::try_from(total).unwrap() + 1)
             .initializer(|_, _| panic!("initialized without pages"));
-        let (made, shortage) = with_shortage(|| builder.create());
-        assert_eq!(made.err(), Some(DynamicStorageCreateError::InternalError));
+        let (created, shortage) = with_shortage(|| builder.create());
+        assert_eq!(
+            created.err(),
+            Some(DynamicStorageCreateError::InternalError)
+        );
         let shortage = shortage.unwrap();
         assert!(shortage.needed > total);
         assert_eq!(shortage.error, Errno::NOSPC);

@@ -604,9 +604,9 @@ fn an_unused_mailbox_is_removed() {
     let (living, _) = domain.listening();
     let of_the_living = domain.files();
     let made_since = |end: &str| {
-        let mut made = domain.files();
-        made.retain(|file| file.ends_with(end) && !of_the_living.contains(file));
-        made
+        let mut files = domain.files();
+        files.retain(|file| file.ends_with(end) && !of_the_living.contains(file));
+        files
     };
     let mut receiver = Process::start(&domain, "receive", Incarnation::from_u64(1));
     until("mailbox", || !made_since(".port_tag").is_empty());

@@ -101,12 +101,12 @@ impl Faulty {
         if plan.forced.is_some() {
             return plan.forced;
         }
-        let mut left = plan.random.f64();
+        let mut remaining = plan.random.f64();
         for (fault, rate) in plan.rates.clone() {
-            if left < rate {
+            if remaining < rate {
                 return Some(fault);
             }
-            left -= rate;
+            remaining -= rate;
         }
         None
     }
@@ -180,8 +180,8 @@ impl Transport for Faulty {
         self.inner.abandon(attempt, to)
     }
 
-    fn left(&self, location: &Location) {
-        self.inner.left(location);
+    fn location_vacated(&self, location: &Location) {
+        self.inner.location_vacated(location);
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {
@@ -270,7 +270,7 @@ impl Sink for Filter {
         self.sink.introduced(peer);
     }
 
-    fn parted(&self, peer: &Introduction) {
-        self.sink.parted(peer);
+    fn disconnected(&self, peer: &Introduction) {
+        self.sink.disconnected(peer);
     }
 }

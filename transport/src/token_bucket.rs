@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 #[derive(Debug, Clone)]
 pub struct TokenBucket {
     /// Tokens. Negative after more was [spent](Self::spend) than there was.
-    left: f64,
+    tokens: f64,
     at: Instant,
 }
 
@@ -18,7 +18,7 @@ impl TokenBucket {
     #[must_use]
     pub fn new(per_second: f64, now: Instant) -> Self {
         Self {
-            left: per_second,
+            tokens: per_second,
             at: now,
         }
     }
@@ -38,9 +38,9 @@ impl TokenBucket {
     /// number of its creation.
     pub fn take_of(&mut self, amount: f64, per_second: f64, burst: f64, now: Instant) -> bool {
         self.refill(per_second, burst, now);
-        let enough = self.left >= amount;
+        let enough = self.tokens >= amount;
         if enough {
-            self.left -= amount;
+            self.tokens -= amount;
         }
         enough
     }
@@ -49,13 +49,13 @@ impl TokenBucket {
     /// returns the time until it no longer is, limited to one second.
     pub fn spend(&mut self, amount: f64, per_second: f64, now: Instant) -> Option<Duration> {
         self.refill(per_second, per_second, now);
-        self.left = (self.left - amount).max(-per_second);
-        (self.left < 0.0).then(|| Duration::from_secs_f64(-self.left / per_second))
+        self.tokens = (self.tokens - amount).max(-per_second);
+        (self.tokens < 0.0).then(|| Duration::from_secs_f64(-self.tokens / per_second))
     }
 
     fn refill(&mut self, per_second: f64, most: f64, now: Instant) {
         let since = now.saturating_duration_since(self.at).as_secs_f64();
-        self.left = (self.left + since * per_second).min(most);
+        self.tokens = (self.tokens + since * per_second).min(most);
         self.at = self.at.max(now);
     }
 }

@@ -71,7 +71,7 @@ pub trait Transport: Send + Sync + 'static {
     /// The service at this location has announced other locations and no longer this one. A transport with
     /// connections takes another one for later parcels to this service, unless the peer gives a sign of life on
     /// the connection with this location.
-    fn left(&self, location: &Location) {
+    fn location_vacated(&self, location: &Location) {
         let _ = location;
     }
 
@@ -205,7 +205,7 @@ pub trait Sink: Send + Sync {
 
     /// The connection on which this service had [introduced](Self::introduced) itself has ended.
     /// Other connections with it may remain: there is one introduction for each connection.
-    fn parted(&self, peer: &Introduction) {
+    fn disconnected(&self, peer: &Introduction) {
         let _ = peer;
     }
 }

@@ -315,9 +315,9 @@ async fn register(
 /// Waits for half of the time until a lease ends.
 async fn half(lease: Option<Time>) {
     let now = SystemTime::now();
-    let left = lease.map(|lease| lease.to_system_time(now).duration_since(now));
-    match left {
-        Some(left) => tokio::time::sleep(left.unwrap_or_default() / 2).await,
+    let lease_left = lease.map(|lease| lease.to_system_time(now).duration_since(now));
+    match lease_left {
+        Some(lease_left) => tokio::time::sleep(lease_left.unwrap_or_default() / 2).await,
         None => std::future::pending().await,
     }
 }

@@ -147,14 +147,14 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     };
     match arguments.action {
         Action::Init { agents, valid } => {
-            let made = keys.init(&config.mts.name, &agents, valid.unwrap_or(VALID));
-            let made = made.map_err(|error| failed(&error, &keys))?;
+            let certificate = keys.init(&config.mts.name, &agents, valid.unwrap_or(VALID));
+            let certificate = certificate.map_err(|error| failed(&error, &keys))?;
             output::text(&format!(
                 "created a key and a certificate for {}\n{}\
                  give {} to the owners of other hosts, and add to the configuration:\n\n\
                  [security]\nkeys = {:?}\n",
-                escape(made.certified().mts()),
-                described(&made),
+                escape(certificate.certified().mts()),
+                described(&certificate),
                 keys.own_file().display(),
                 // Absolute, so that it is valid in any working directory of the gateway.
                 path::absolute(keys.dir())
@@ -360,7 +360,7 @@ fn described(certificate: &Certificate) -> String {
 /// The last day of validity, with a note if the certificate is not valid now or expires soon.
 fn valid_until(certificate: &Certificate) -> String {
     let date = date(certificate.validity().1);
-    match Holding::at(SystemTime::now(), certificate).told() {
+    match Holding::at(SystemTime::now(), certificate).problem() {
         Some(note) => format!("{date} ({note})"),
         None => date,
     }
@@ -370,7 +370,7 @@ fn valid_until(certificate: &Certificate) -> String {
 fn validity_note(certificate: &Certificate, whose: Whose) -> String {
     let now = SystemTime::now();
     let holding = Holding::at(now, certificate);
-    match (holding, holding.told(), holding.advice(now, whose)) {
+    match (holding, holding.problem(), holding.advice(now, whose)) {
         (Holding::Ended | Holding::NotYet, Some(problem), Some(advice)) => format!(
             "note: the certificate of {} {problem}; {advice}\n",
             escape(certificate.certified().mts())

@@ -162,8 +162,8 @@ fn cells(status: &ResourceStatus) -> [String; 6] {
     if let Some(rival) = &status.contested_by {
         owner += &format!("\ncontested by {}", escape_name(rival));
     }
-    let lease = status.expires.map(|left| {
-        let whole = Duration::from_secs(left.as_secs());
+    let lease = status.expires.map(|lease_left| {
+        let whole = Duration::from_secs(lease_left.as_secs());
         humantime::format_duration(whole).to_string()
     });
     let mut waiting: Vec<String> = status
@@ -195,7 +195,7 @@ fn in_json(status: &ResourceStatus) -> Value {
         "answered": status.is_reported,
         "holder": status.holder,
         "fence": status.fence.as_ref().map(ToString::to_string),
-        "lease_ms": status.expires.map(|left| u64::try_from(left.as_millis()).unwrap_or(u64::MAX)),
+        "lease_ms": status.expires.map(|lease_left| u64::try_from(lease_left.as_millis()).unwrap_or(u64::MAX)),
         "waiters": status.waiters,
         "waiting": status.waiting,
         "contested_by": status.contested_by,

@@ -250,10 +250,10 @@ fn standing(standing: &Standing) -> String {
             failures,
             error,
         } => {
-            let left = humantime::format_duration(Duration::from_millis(*milliseconds));
+            let time_left = humantime::format_duration(Duration::from_millis(*milliseconds));
             let times = if *failures == 1 { "time" } else { "times" };
             format!(
-                "failed {failures} {times}, tried last for {left}: {}",
+                "failed {failures} {times}, tried last for {time_left}: {}",
                 escape(error)
             )
         }

@@ -96,7 +96,7 @@ pub(crate) struct Gateway {
     child: ChildGuard,
     pub(crate) settings: Vec<String>,
     locations: Vec<String>,
-    told: Arc<Mutex<Vec<String>>>,
+    log_lines: Arc<Mutex<Vec<String>>>,
 }
 
 impl Gateway {
@@ -109,16 +109,16 @@ impl Gateway {
         command.stdin(Stdio::null());
         command.stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = ChildGuard::start(&mut command);
-        let told: Arc<Mutex<Vec<String>>> = Arc::default();
-        let (keep, errors) = (Arc::clone(&told), child.child().stderr.take().unwrap());
+        let log_lines: Arc<Mutex<Vec<String>>> = Arc::default();
+        let (keep, errors) = (Arc::clone(&log_lines), child.child().stderr.take().unwrap());
         std::thread::spawn(move || {
             for line in BufReader::new(errors).lines().map_while(Result::ok) {
-                let mut kept = keep.lock();
+                let mut lines = keep.lock();
                 // A panic message is always stored.
-                if kept.len() >= LINES && !line.contains("panicked") {
-                    kept.remove(0);
+                if lines.len() >= LINES && !line.contains("panicked") {
+                    lines.remove(0);
                 }
-                kept.push(line);
+                lines.push(line);
             }
         });
         let mut ready = String::new();
@@ -126,7 +126,7 @@ impl Gateway {
             .read_line(&mut ready)
             .unwrap();
         let ready: Value = serde_json::from_str(&ready).unwrap_or_else(|error| {
-            panic!("the gateway is not ready ({error}): {:?}", told.lock())
+            panic!("the gateway is not ready ({error}): {:?}", log_lines.lock())
         });
         let locations = ready["locations"].as_array().unwrap().iter();
         let locations = locations.map(|location| location.as_str().unwrap());
@@ -135,7 +135,7 @@ impl Gateway {
             child,
             settings,
             locations: locations.collect(),
-            told,
+            log_lines,
         }
     }
 
@@ -168,12 +168,12 @@ impl Gateway {
 
     /// Ends the gateway with SIGTERM and checks that it exits successfully.
     pub(crate) fn end(mut self) {
-        let told = self.told.lock().join("\n");
-        assert!(!told.contains("panicked"), "{told}");
+        let log_lines = self.log_lines.lock().join("\n");
+        assert!(!log_lines.contains("panicked"), "{log_lines}");
         let ended = self.child.ended();
         assert!(
             ended.is_none(),
-            "the gateway has already ended ({ended:?}): {told}"
+            "the gateway has already ended ({ended:?}): {log_lines}"
         );
         let pid = self.child.id();
         self.child.signal("-TERM");
@@ -187,7 +187,7 @@ impl Gateway {
         assert!(
             status.success(),
             "{status}: {}",
-            self.told.lock().join("\n")
+            self.log_lines.lock().join("\n")
         );
     }
 }

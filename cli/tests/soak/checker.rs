@@ -314,11 +314,11 @@ impl Logs {
                     .or_default() += 1;
                 continue;
             };
-            let told = failure.clone().unwrap_or_else(|| {
+            let outcome = failure.clone().unwrap_or_else(|| {
                 let words: Vec<&str> = how.split([' ', ',', ';']).take(3).collect();
                 words.join(" ")
             });
-            *report.outcomes.entry(told).or_default() += 1;
+            *report.outcomes.entry(outcome).or_default() += 1;
         }
         self.breaches.append(&mut breaches);
     }

@@ -155,21 +155,24 @@ impl Process {
     }
 
     fn count_left(&self, name: &str) -> usize {
-        let left = format!("left {name}");
+        let deregistered = format!("left {name}");
         self.said
             .lock()
             .iter()
-            .filter(|said| **said == left)
+            .filter(|said| **said == deregistered)
             .count()
     }
 
     /// Whether the agent is registered in this process at present. Moving agents register and leave
     /// repeatedly.
     fn has(&self, name: &str) -> bool {
-        let (came, left) = (format!("registered {name}"), format!("left {name}"));
+        let (registered, deregistered) = (format!("registered {name}"), format!("left {name}"));
         let said = self.said.lock();
-        let last = said.iter().rev().find(|said| [&came, &left].contains(said));
-        last == Some(&came)
+        let last = said
+            .iter()
+            .rev()
+            .find(|said| [&registered, &deregistered].contains(said));
+        last == Some(&registered)
     }
 
     fn signal(&mut self, signal: &str) {
@@ -717,10 +720,10 @@ impl Stage {
         let mut running = ChildGuard::start(&mut command);
         let input = running.child().stdin.take().unwrap();
         let said = Arc::<Mutex<Vec<String>>>::default();
-        let (output, heard) = (running.child().stdout.take().unwrap(), said.clone());
+        let (output, lines) = (running.child().stdout.take().unwrap(), said.clone());
         std::thread::spawn(move || {
             for line in BufReader::new(output).lines().map_while(Result::ok) {
-                heard.lock().push(line);
+                lines.lock().push(line);
             }
         });
         let mut process = Process {

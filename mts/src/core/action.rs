@@ -45,7 +45,7 @@ pub enum Action {
     /// One receiver's outcome of a letter sent here.
     Outcome {
         /// The submission.
-        send: SubmissionId,
+        submission: SubmissionId,
         /// The receiver.
         receiver: Arc<str>,
         /// The outcome.
@@ -55,7 +55,7 @@ pub enum Action {
     /// be sent to this location, from which its letter came or which a legacy peer states as its
     /// own. The letter waits for the [refresh](Self::Refresh) that follows: the contacts are published to the
     /// processes of this host before it.
-    Heard {
+    ContactSeen {
         /// Its name in the letter.
         name: String,
         /// Its incarnation; unknown for an agent of a legacy peer.
@@ -66,7 +66,7 @@ pub enum Action {
         host: Option<String>,
     },
     /// An agent of another host that is in the directory as a contact has sent another letter.
-    HeardAgain {
+    ContactSeenAgain {
         /// Its name.
         name: Arc<str>,
     },
@@ -95,7 +95,7 @@ pub enum Action {
     /// none.
     Resolved {
         /// The submission.
-        send: SubmissionId,
+        submission: SubmissionId,
         /// Number of outcomes, of which some may have been reported already.
         outcomes: usize,
     },

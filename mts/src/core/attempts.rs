@@ -86,7 +86,7 @@ impl AttemptTable {
     /// The reason for which a letter to an agent fails that the directory does not list. For a [lost
     /// agent](fipa_sds::Directory::lost_agents), the attempt names the location of its gateway.
     pub(super) fn absence(&self, name: &str) -> (FailureReason, Option<Attempt>) {
-        let Some(lost) = self.view.lost(name) else {
+        let Some(lost) = self.view.lost_agent(name) else {
             return (FailureReason::NoSuchAgent, None);
         };
         let location = lost.locations.first();

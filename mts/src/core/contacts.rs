@@ -87,7 +87,9 @@ impl Core {
             }
             if known.locations.first() == Some(&from.location) {
                 let name = Arc::clone(&known.name);
-                self.table.actions.push_back(Action::HeardAgain { name });
+                self.table
+                    .actions
+                    .push_back(Action::ContactSeenAgain { name });
                 return false;
             }
         }
@@ -107,7 +109,7 @@ impl Core {
             return false;
         }
         let location = from.location.clone();
-        self.table.actions.push_back(Action::Heard {
+        self.table.actions.push_back(Action::ContactSeen {
             name,
             agent,
             location,
@@ -136,7 +138,9 @@ impl Core {
                 let address = location.authority().parse::<SocketAddr>();
                 if address.is_ok_and(|address| address.ip().to_canonical() == from) {
                     let name = Arc::clone(&known.name);
-                    self.table.actions.push_back(Action::HeardAgain { name });
+                    self.table
+                        .actions
+                        .push_back(Action::ContactSeenAgain { name });
                 }
                 return false;
             }
@@ -148,7 +152,7 @@ impl Core {
             tracing::debug!(%from, "rate limit of new agents of legacy peers exceeded; this one cannot be answered");
             return false;
         }
-        self.table.actions.push_back(Action::Heard {
+        self.table.actions.push_back(Action::ContactSeen {
             name,
             agent: Incarnation::UNKNOWN,
             location,

@@ -27,7 +27,7 @@ pub(crate) struct Departed {
 
 impl Departed {
     /// Records an entry that left the directory or was replaced by another registration.
-    pub(super) fn left(&mut self, now: Instant, entry: &Entry) {
+    pub(super) fn record_departure(&mut self, now: Instant, entry: &Entry) {
         if entry.reach != Reach::Local || entry.role != Role::Agent {
             return;
         }
@@ -70,7 +70,7 @@ mod tests {
         let (entry, now) = (entry(), Instant::now());
         let mut departed = Departed::default();
         assert!(!departed.contains(now, entry.incarnation));
-        departed.left(now, &entry);
+        departed.record_departure(now, &entry);
         assert!(departed.contains(now, entry.incarnation));
         assert!(!departed.contains(now, Incarnation::from_u64(9)));
         assert!(!departed.contains(now + MEMORY * 2, entry.incarnation));
@@ -82,12 +82,12 @@ mod tests {
         let mut departed = Departed::default();
         for number in 0..10_000 {
             entry.incarnation = Incarnation::from_u64(100 + number);
-            departed.left(now, &entry);
+            departed.record_departure(now, &entry);
         }
         assert_eq!(departed.since.len(), MAX_DEPARTED);
         assert_eq!(departed.order.len(), MAX_DEPARTED);
         entry.incarnation = Incarnation::from_u64(8);
-        departed.left(now + MEMORY * 2, &entry);
+        departed.record_departure(now + MEMORY * 2, &entry);
         assert_eq!(departed.since.len(), 1);
     }
 }

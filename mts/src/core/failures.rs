@@ -181,18 +181,18 @@ impl Core {
             let deadline = now.instant + FAILURE_DEADLINE;
             let letter_of = (stream.receiver, sequence);
             let origin = Origin::FailureMessage;
-            let delivery = OpenLetter::new(now.instant, origin, letter, letter_of, deadline);
+            let open_letter = OpenLetter::new(now.instant, origin, letter, letter_of, deadline);
             self.table
                 .notice(stream, sequence, &entry.name, || News::Sent {
-                    send: None,
-                    letter: delivery.letter.clone(),
+                    submission: None,
+                    letter: open_letter.letter.clone(),
                 });
             if stated.is_some()
                 && let Some(lane) = self.lanes.get_mut(&id)
             {
                 lane.set_stated(Arc::clone(&entry));
             }
-            self.put(now, id, delivery);
+            self.put(now, id, open_letter);
         }
     }
 }

@@ -68,14 +68,14 @@ impl Core {
             unanswered,
         };
         if let Some(id) = self.lane_ids.get(&key).copied() {
-            let mut kept = Some(upstream);
+            let mut not_adopted = Some(upstream);
             self.with_lane(now, id, |lane, table| {
                 let letter = (label.sequence, label.after);
-                kept = kept
+                not_adopted = not_adopted
                     .take()
                     .and_then(|it| lane.adopt(now.instant, letter, it, table).err());
             });
-            upstream = match kept {
+            upstream = match not_adopted {
                 Some(upstream) => upstream,
                 None => return taken,
             };
@@ -109,12 +109,12 @@ impl Core {
             upstreams: smallvec![upstream],
         };
         let letter_of = (stream.receiver, label.sequence);
-        let mut delivery = OpenLetter::new(now.instant, origin, stamped, letter_of, deadline);
-        delivery.after = label.after;
-        delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
+        let mut open_letter = OpenLetter::new(now.instant, origin, stamped, letter_of, deadline);
+        open_letter.after = label.after;
+        open_letter.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
         let sender = (stream.sender, from.is_remote());
         if let Some(until) = self.found_by_peer(now, sender, &entry, label.remaining) {
-            delivery.delay_until(until);
+            open_letter.delay_until(until);
             if self.lanes.get(&id).is_some_and(|lane| lane.is_empty()) {
                 let wait = until.saturating_duration_since(now.instant);
                 log_limit::info!(
@@ -124,7 +124,7 @@ impl Core {
                 );
             }
         }
-        self.put(now, id, delivery);
+        self.put(now, id, open_letter);
         taken
     }
 

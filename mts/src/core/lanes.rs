@@ -29,9 +29,9 @@ const IDLE_TIME_IN_A_CROWD: Duration = Duration::from_secs(1);
 
 impl Core {
     /// Puts a letter into its lane and dispatches what can be dispatched.
-    pub(super) fn put(&mut self, now: Now, lane: LaneId, delivery: Box<OpenLetter>) {
+    pub(super) fn put(&mut self, now: Now, lane: LaneId, open_letter: Box<OpenLetter>) {
         self.with_lane(now, lane, |lane, table| {
-            lane.push(delivery, table);
+            lane.push(open_letter, table);
             lane.pump(now.instant, table);
         });
     }

@@ -226,12 +226,12 @@ impl FailureLimit {
     pub(super) fn debit(&mut self, from: Option<IpAddr>, bytes: usize) -> bool {
         let Some(from) = from else { return true };
         let credit = self.credits.get_mut(&quota_address(from));
-        let left = credit
+        let remaining = credit
             .as_ref()
             .and_then(|it| it.bytes.checked_sub(bytes as u64));
-        match (credit, left) {
-            (Some(credit), Some(left)) => {
-                credit.bytes = left;
+        match (credit, remaining) {
+            (Some(credit), Some(remaining)) => {
+                credit.bytes = remaining;
                 true
             }
             _ => {

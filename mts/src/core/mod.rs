@@ -161,7 +161,7 @@ pub struct Core {
     /// Whether the service has ended, and so sends nothing.
     closed: bool,
     next_lane: u64,
-    next_send: u64,
+    next_submission: u64,
     /// Next sequence number of the letters that this service sends in its own name.
     next_sequence: u64,
     next_forget: Option<Instant>,
@@ -203,7 +203,7 @@ impl Core {
             ending: false,
             closed: false,
             next_lane: 1,
-            next_send: 1,
+            next_submission: 1,
             next_sequence: 1,
             next_forget: None,
             crowd: 2 * IDLE_LANES,

@@ -24,14 +24,14 @@ impl Core {
     /// gateway answers letters for an agent that left its host with [`Answer::Moved`](fipa_transport::Answer::Moved).
     pub fn handle_departure(&mut self, now: Now, entry: &Entry) {
         if self.table.config.forwards {
-            self.table.departed.left(now.instant, entry);
-            self.principals.left(entry);
+            self.table.departed.record_departure(now.instant, entry);
+            self.principals.record_departure(entry);
         }
     }
 
     /// Handles another entry of the same registration. Must be called before
     /// [`handle_directory_change`](Self::handle_directory_change), which then ends the attempts at the locations
-    /// that its service has left. Returns these locations, for [`left`](fipa_transport::Transport::left). The
+    /// that its service has left. Returns these locations, for [`location_vacated`](fipa_transport::Transport::location_vacated). The
     /// announcement of a service with a certificate counts only if it comes from the service itself.
     pub fn handle_relocation(&mut self, before: &Entry, after: &Entry) -> Vec<Location> {
         let is_there = |service: Incarnation| {
@@ -42,7 +42,7 @@ impl Core {
             let principal = self.principals.of_service(service);
             matches!(principal, Some(Principal::Certificate(_)))
         };
-        let left: Vec<Location> = before
+        let vacated: Vec<Location> = before
             .locations
             .iter()
             .filter(|it| !it.kind().is_host_local() && !after.locations.contains(it))
@@ -50,10 +50,10 @@ impl Core {
             .filter(|it| after.source == Source::Exchange || !is_proved(it.incarnation()))
             .cloned()
             .collect();
-        for location in &left {
+        for location in &vacated {
             self.table.routes.service_left(location);
         }
-        left
+        vacated
     }
 
     /// Sets the services to keep in touch with.
@@ -68,10 +68,10 @@ impl Core {
     }
 
     /// Handles the end of a connection that was opened for this location.
-    pub fn handle_parted(&mut self, now: Now, peer: &Introduction) {
-        self.principals.parted(peer);
+    pub fn handle_disconnected(&mut self, now: Now, peer: &Introduction) {
+        self.principals.disconnected(peer);
         if let Some(dialed) = &peer.dialed {
-            self.peers.parted(now.instant, dialed);
+            self.peers.disconnected(now.instant, dialed);
         }
     }
 
@@ -144,7 +144,7 @@ impl Core {
 
     /// Opens connections to these locations, to announce the current locations of this service to
     /// them: dispatches one credit to each, which no lane waits for. It is not repeated.
-    pub fn greet(&mut self, services: Vec<(Arc<str>, Location)>) {
+    pub fn announce_locations(&mut self, services: Vec<(Arc<str>, Location)>) {
         for (name, location) in services {
             let no_stream = Stream::between(Incarnation::UNKNOWN, Incarnation::UNKNOWN);
             let parcel = note_parcel(no_stream, name, 0, Body::Credit);

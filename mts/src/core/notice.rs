@@ -31,7 +31,7 @@ pub enum News {
     Sent {
         /// The call of [`Core::submit`](super::Core::submit), if any: letters of one call carry one
         /// message to several receivers.
-        send: Option<SubmissionId>,
+        submission: Option<SubmissionId>,
         /// The letter.
         letter: Letter,
     },

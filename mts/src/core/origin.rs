@@ -12,7 +12,7 @@ use crate::failure::Failed;
 #[derive(Debug)]
 pub(crate) enum Origin {
     /// An agent of this process, which gets an outcome.
-    Local { send: SubmissionId },
+    Local { submission: SubmissionId },
     /// Other message transport services, which get a late answer or a report.
     Forwarded { upstreams: SmallVec<[Upstream; 1]> },
     /// The source at a legacy peer, which gets this in a failure message, if anything.

@@ -50,7 +50,7 @@ const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 /// Pause before a check after a connection with the peer has ended, which doubles while connections do not
 /// last until the next regular check.
-const PARTED_PAUSE: Duration = Duration::from_millis(200);
+const RECONNECT_PAUSE: Duration = Duration::from_millis(200);
 
 /// The static peers of a service.
 #[derive(Debug, Default)]
@@ -82,9 +82,9 @@ struct PeerLocation {
     error: Option<TransportError>,
     last_asked: Option<Instant>,
     /// Number of connections that have ended since one lasted.
-    parted: u32,
+    short_connections: u32,
     /// Whether a connection has ended since the latest answer.
-    has_parted: bool,
+    has_disconnected: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -128,17 +128,17 @@ impl Peers {
     }
 
     /// Handles the end of a connection that was opened for this location.
-    pub(super) fn parted(&mut self, now: Instant, location: &Location) {
+    pub(super) fn disconnected(&mut self, now: Instant, location: &Location) {
         let candidates = self
             .all
             .iter_mut()
             .flat_map(|static_peer| &mut static_peer.candidates);
         for candidate in candidates.filter(|candidate| candidate.location == *location) {
-            let again = candidate.parted.saturating_sub(1);
-            let pause = PARTED_PAUSE.saturating_mul(1 << again.min(10));
+            let again = candidate.short_connections.saturating_sub(1);
+            let pause = RECONNECT_PAUSE.saturating_mul(1 << again.min(10));
             let pause = pause.min(LONGEST_PAUSE);
-            candidate.parted = candidate.parted.saturating_add(1);
-            candidate.has_parted = true;
+            candidate.short_connections = candidate.short_connections.saturating_add(1);
+            candidate.has_disconnected = true;
             let soon = candidate.last_asked.map_or(now, |asked| asked + pause);
             candidate.ask_by(soon.max(now));
         }
@@ -306,8 +306,8 @@ impl StaticPeer {
             log_limit::info!(of: &*self.peer.name, peer = %self.peer.name, at = %candidate.location, "the static peer answers");
         }
         candidate.state = State::AskAt(now + KEEP);
-        if !std::mem::replace(&mut candidate.has_parted, false) {
-            candidate.parted = 0;
+        if !std::mem::replace(&mut candidate.has_disconnected, false) {
+            candidate.short_connections = 0;
         }
         self.answers = Some(candidate.location.clone());
         for candidate in &mut self.candidates {
@@ -320,11 +320,11 @@ impl StaticPeer {
         let Some(candidate) = self.candidates.get_mut(index) else {
             return;
         };
-        let parted = self
+        let was_answering = self
             .answers
             .take_if(|at| *at == candidate.location)
             .is_some();
-        if parted || candidate.failures == 0 && self.answers.is_none() {
+        if was_answering || candidate.failures == 0 && self.answers.is_none() {
             log_limit::info!(of: &*self.peer.name, peer = %self.peer.name, at = %candidate.location, %error, "the static peer does not answer");
         }
         let pause = FIRST_PAUSE.saturating_mul(1 << candidate.failures.min(10));
@@ -333,7 +333,7 @@ impl StaticPeer {
         if self.answers.is_none() {
             candidate.error = Some(error);
         }
-        if parted {
+        if was_answering {
             let others = self.candidates.iter_mut().enumerate();
             others
                 .filter(|(other, _)| *other != index)
@@ -369,8 +369,8 @@ impl PeerLocation {
             failures: 0,
             error: None,
             last_asked: None,
-            parted: 0,
-            has_parted: false,
+            short_connections: 0,
+            has_disconnected: false,
         }
     }
 

@@ -29,7 +29,7 @@ pub(super) struct Principals {
     /// Senders that were not in the directory when their first letter came, and those that left it;
     /// `None` for one whose gateway was never connected.
     senders: Map<Incarnation, Option<Principal>>,
-    heard: Map<Option<Principal>, VecDeque<Incarnation>>,
+    senders_by_owner: Map<Option<Principal>, VecDeque<Incarnation>>,
 }
 
 #[derive(Debug)]
@@ -135,7 +135,7 @@ impl Principals {
     }
 
     /// Handles the end of a connection with this service.
-    pub(super) fn parted(&mut self, peer: &Introduction) {
+    pub(super) fn disconnected(&mut self, peer: &Introduction) {
         let service = self.services.get_mut(&peer.hop.location.incarnation());
         if let Some(service) = service.filter(|it| it.principal == peer.hop.principal) {
             service.connections = service.connections.saturating_sub(1);
@@ -265,9 +265,9 @@ impl Principals {
         // Letters of a service itself come only on its own links. A service that introduces itself
         // with the registration of an agent takes nothing from that agent.
         let is_agent = known.as_ref().is_some_and(|it| it.role == Role::Agent);
-        let is_heard = self.senders.get(&sender) == Some(&Some(from.principal));
+        let is_bound = self.senders.get(&sender) == Some(&Some(from.principal));
         if !is_agent
-            && !is_heard
+            && !is_bound
             && self.services.contains_key(&sender)
             && sender != from.location.incarnation()
         {
@@ -288,7 +288,7 @@ impl Principals {
         };
         let owner = match owner {
             Some(owner) => owner,
-            None => self.first_heard(sender, from.principal)?,
+            None => self.bind_new_sender(sender, from.principal)?,
         };
         match owner == from.principal {
             true => Ok(()),
@@ -299,7 +299,7 @@ impl Principals {
     /// Records the principal of an entry that left the directory. The gateway may only have lost
     /// its connection, and other principals must not send letters in the agent's name in the
     /// meantime.
-    pub(super) fn left(&mut self, entry: &Entry) {
+    pub(super) fn record_departure(&mut self, entry: &Entry) {
         let owner = match entry.reach {
             Reach::Local => Some(Principal::Host),
             Reach::Remote { gateway } => self.services.get(&gateway).map(|it| it.principal),
@@ -309,7 +309,7 @@ impl Principals {
         }
     }
 
-    fn first_heard(
+    fn bind_new_sender(
         &mut self,
         sender: Incarnation,
         principal: Principal,
@@ -329,14 +329,14 @@ impl Principals {
         if self.senders.insert(sender, owner) == Some(owner) {
             return;
         }
-        let heard = self.heard.entry(owner).or_default();
-        if heard.len() >= MAX_SENDERS
-            && let Some(oldest) = heard.pop_front()
+        let of_owner = self.senders_by_owner.entry(owner).or_default();
+        if of_owner.len() >= MAX_SENDERS
+            && let Some(oldest) = of_owner.pop_front()
             && self.senders.get(&oldest) == Some(&owner)
         {
             self.senders.remove(&oldest);
         }
-        heard.push_back(sender);
+        of_owner.push_back(sender);
     }
 }
 
@@ -385,7 +385,7 @@ mod tests {
         let other = principals.check_service(&hop(SERVICE, CREX), true, &no_agents());
         assert_eq!(other, Err(PrincipalError::Service));
         // The end of the impostor's connection changes nothing.
-        principals.parted(&peer("rover", CREX));
+        principals.disconnected(&peer("rover", CREX));
         principals.introduced(&peer("rover", CREX), &no_agents());
         assert_eq!(
             principals.check_service(&hop(SERVICE, ROVER), true, &no_agents()),
@@ -397,7 +397,7 @@ mod tests {
     fn a_certificate_can_be_renewed_under_the_same_name_only() {
         let mut principals = Principals::default();
         principals.introduced(&peer("rover", ROVER), &no_agents());
-        principals.parted(&peer("rover", ROVER));
+        principals.disconnected(&peer("rover", ROVER));
         principals.introduced(&peer("crex", CREX), &no_agents());
         let other = principals.check_service(&hop(SERVICE, CREX), true, &no_agents());
         assert_eq!(other, Err(PrincipalError::Service));
@@ -433,14 +433,14 @@ mod tests {
         let directory = no_agents();
         let rover = peer("rover", ROVER);
         principals.introduced(&rover, &directory);
-        principals.parted(&rover);
+        principals.disconnected(&rover);
         for service in 0..MAX_SERVICES as u64 {
             let invented = Introduction {
                 hop: hop(1000 + service, CREX),
                 ..peer("crex", CREX)
             };
             principals.introduced(&invented, &directory);
-            principals.parted(&invented);
+            principals.disconnected(&invented);
         }
         assert!(!principals.accepts(&peer("crex", CREX), &directory));
         principals.introduced(&peer("crex", CREX), &directory);
@@ -457,7 +457,7 @@ mod tests {
                 ..peer("rover", ROVER)
             };
             principals.introduced(&peer, &directory);
-            principals.parted(&peer);
+            principals.disconnected(&peer);
         }
         assert_eq!(principals.services.len(), MAX_SERVICES);
         assert_eq!(principals.order.len(), MAX_SERVICES);

@@ -126,11 +126,11 @@ impl AttemptTable {
         match self.routes.failing(now, location) {
             None => Standing::Ready,
             Some((failures, retry_at)) => {
-                let left = retry_at.saturating_duration_since(now);
+                let time_left = retry_at.saturating_duration_since(now);
                 let tally = self.tallies.0.get(location);
                 let error = tally.and_then(|tally| tally.last_error.lock().clone());
                 Standing::Failing {
-                    milliseconds: u64::try_from(left.as_millis()).unwrap_or(u64::MAX),
+                    milliseconds: u64::try_from(time_left.as_millis()).unwrap_or(u64::MAX),
                     failures,
                     error: error.map(|(text, _)| text).unwrap_or_default(),
                 }
@@ -203,8 +203,8 @@ impl Core {
             return None;
         }
         let entry = self.table.receiver(registration, receiver)?;
-        let here = entry.role == Role::Agent && entry.reach == Reach::Local;
-        let way = here.then(|| self.table.choose(now.instant, &entry, &[]))?;
+        let is_local = entry.role == Role::Agent && entry.reach == Reach::Local;
+        let way = is_local.then(|| self.table.choose(now.instant, &entry, &[]))?;
         Some((way?, stamp::max_len(&config.name)))
     }
 

@@ -14,7 +14,7 @@ use crate::Map;
 pub(crate) struct Routes {
     health: Map<Location, Health>,
     /// The latest locations that their services have left for others.
-    left: VecDeque<Location>,
+    vacated: VecDeque<Location>,
 }
 
 #[derive(Debug)]
@@ -29,7 +29,7 @@ const LONGEST_PENALTY: Duration = Duration::from_secs(5);
 const FIRST_PENALTY: Duration = Duration::from_millis(100);
 
 /// Maximum number of locations that are remembered after their services have left them.
-const MAX_LEFT: usize = 64;
+const MAX_VACATED: usize = 64;
 
 /// Maximum number of failed routes that are remembered.
 const MAX_HEALTH: usize = 4096;
@@ -37,16 +37,16 @@ const MAX_HEALTH: usize = 4096;
 impl Routes {
     /// Records a location that its service has left for another one.
     pub(super) fn service_left(&mut self, location: &Location) {
-        self.left.retain(|other| other != location);
-        if self.left.len() >= MAX_LEFT {
-            self.left.pop_front();
+        self.vacated.retain(|other| other != location);
+        if self.vacated.len() >= MAX_VACATED {
+            self.vacated.pop_front();
         }
-        self.left.push_back(location.clone());
+        self.vacated.push_back(location.clone());
     }
 
     /// Whether the service at this location has recently left it for another one.
     pub(crate) fn service_has_left(&self, location: &Location) -> bool {
-        self.left.contains(location)
+        self.vacated.contains(location)
     }
 
     /// Returns the best location of this receiver that is not in `tried`: by this order of transports,

@@ -101,8 +101,8 @@ pub enum Belief {
 /// the letter, if one is in progress or in custody. `handed` is whether the letter was ever handed
 /// to the reporting service.
 #[must_use]
-pub fn believe(handed: bool, told: CustodyReport, transfer: u64, current: Option<u64>) -> Belief {
-    match told {
+pub fn believe(handed: bool, report: CustodyReport, transfer: u64, current: Option<u64>) -> Belief {
+    match report {
         _ if !handed => Belief::Ignored,
         CustodyReport::Delivered => Belief::Believed,
         CustodyReport::NotDelivered { .. } if current == Some(transfer) => Belief::Believed,
@@ -114,8 +114,8 @@ pub fn believe(handed: bool, told: CustodyReport, transfer: u64, current: Option
 /// Returns the predecessor of a held letter of which another copy arrived: the smaller one, because
 /// only the sender's process lowers it.
 #[must_use]
-pub fn lower(held: u64, told: u64) -> u64 {
-    held.min(told)
+pub fn lower(held: u64, received: u64) -> u64 {
+    held.min(received)
 }
 
 /// Whether a custodian whose lane is full takes this letter: only when it holds a higher one, which
@@ -271,8 +271,8 @@ mod tests {
     fn reports_count_for_the_hand_over_that_they_name() {
         let failed = |uncertain| CustodyReport::NotDelivered { uncertain };
         // The letter was never handed to this service.
-        for told in [CustodyReport::Delivered, failed(true), failed(false)] {
-            assert_eq!(believe(false, told, 3, Some(3)), Belief::Ignored);
+        for report in [CustodyReport::Delivered, failed(true), failed(false)] {
+            assert_eq!(believe(false, report, 3, Some(3)), Belief::Ignored);
         }
         // "Delivered" counts for any hand-over.
         assert_eq!(

@@ -16,7 +16,7 @@ impl AttemptTable {
     /// Reports the end of a letter to its sender, or to the services that handed it over.
     pub(crate) fn settle(
         &mut self,
-        delivery: Box<OpenLetter>,
+        open_letter: Box<OpenLetter>,
         stream: Stream,
         receiver: Arc<str>,
         settlement: Settlement,
@@ -26,7 +26,7 @@ impl AttemptTable {
             sequence,
             deadline,
             ..
-        } = *delivery;
+        } = *open_letter;
         if let Settlement::Outcome(outcome) = &settlement {
             self.notice(stream, sequence, &receiver, || News::Settled {
                 outcome: outcome.clone(),
@@ -34,9 +34,9 @@ impl AttemptTable {
             });
         }
         match (origin, settlement) {
-            (Origin::Local { send }, Settlement::Outcome(outcome)) => {
+            (Origin::Local { submission }, Settlement::Outcome(outcome)) => {
                 self.actions.push_back(Action::Outcome {
-                    send,
+                    submission,
                     receiver,
                     outcome,
                 });

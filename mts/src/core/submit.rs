@@ -34,34 +34,34 @@ impl Core {
     /// known at once are among the actions when this method returns. The number is `None` if a
     /// receiver is not in the view, or is a pattern: [`Action::Resolved`] then reports it after the
     /// directory was refreshed. Letters of one sender are resolved in the order of the calls.
-    pub fn submit(&mut self, now: Now, submission: Submission) -> (SubmissionId, Option<usize>) {
+    pub fn submit(&mut self, now: Now, submitted: Submission) -> (SubmissionId, Option<usize>) {
         let Submission {
             sender,
             letter,
             receivers,
             deadline,
-        } = submission;
+        } = submitted;
         let letter = match &receivers[..] {
             [receiver] => match self.submit_to_name(now, sender, letter, receiver, deadline) {
-                Ok(send) => return (send, Some(1)),
+                Ok(submission) => return (submission, Some(1)),
                 Err(letter) => letter,
             },
             _ => letter,
         };
-        let send = SubmissionId(self.next_send);
-        self.next_send += 1;
+        let submission = SubmissionId(self.next_submission);
+        self.next_submission += 1;
         if self.closed {
             for receiver in &receivers {
                 let receiver = Arc::clone(receiver);
                 let reason = FailureReason::Closed;
-                self.undeliverable(send, sender, receiver, letter.clone(), reason);
+                self.undeliverable(submission, sender, receiver, letter.clone(), reason);
             }
             self.table.undelivered.clear();
-            return (send, Some(receivers.len()));
+            return (submission, Some(receivers.len()));
         }
         let deadline = now.instant + deadline.min(MAX_DEADLINE);
         let mut unresolved = Unresolved {
-            send,
+            submission,
             sender,
             letter,
             receivers,
@@ -69,7 +69,7 @@ impl Core {
         };
         if self.is_in_turn(sender) {
             match self.resolve(now, unresolved, false) {
-                Ok(outcomes) => return (send, Some(outcomes)),
+                Ok(outcomes) => return (submission, Some(outcomes)),
                 Err(back) => unresolved = back,
             }
         }
@@ -77,12 +77,12 @@ impl Core {
         if self.waiting.has_room(sender, len, &self.table.config) {
             let number = self.table.want_refresh();
             self.waiting.push(number, unresolved);
-            return (send, None);
+            return (submission, None);
         }
         let outcomes = unresolved.receivers.len();
         self.fail_receivers(unresolved, FailureReason::QueueFull);
         self.send_failures(now);
-        (send, Some(outcomes))
+        (submission, Some(outcomes))
     }
 
     /// Sends a letter to the agent with exactly this name. One outcome follows.
@@ -111,12 +111,12 @@ impl Core {
         let Some(entry) = self.table.view.named(receiver).filter(is_agent) else {
             return Err(letter);
         };
-        let send = SubmissionId(self.next_send);
-        self.next_send += 1;
+        let submission = SubmissionId(self.next_submission);
+        self.next_submission += 1;
         let deadline = now.instant + deadline.min(MAX_DEADLINE);
-        self.submit_one(now, (send, sender), &entry, letter, deadline);
+        self.submit_one(now, (submission, sender), &entry, letter, deadline);
         self.send_failures(now);
-        Ok(send)
+        Ok(submission)
     }
 
     /// Whether no earlier letter of this sender waits to be resolved.
@@ -157,7 +157,7 @@ impl Core {
             }
         }
         let Unresolved {
-            send,
+            submission,
             letter,
             receivers,
             deadline,
@@ -172,7 +172,7 @@ impl Core {
                 Resolution::Coalition { agents, missing } => {
                     count += missing.len();
                     for member in missing {
-                        self.absent(send, sender, member, letter.clone());
+                        self.absent(submission, sender, member, letter.clone());
                     }
                     if agents.is_empty() {
                         continue;
@@ -183,7 +183,7 @@ impl Core {
             };
             if entries.is_empty() {
                 count += 1;
-                self.absent(send, sender, receiver, letter.clone());
+                self.absent(submission, sender, receiver, letter.clone());
             }
             for entry in entries {
                 let registration = registration_of(&entry);
@@ -192,7 +192,7 @@ impl Core {
                 }
                 reached.push(registration);
                 count += 1;
-                self.submit_one(now, (send, sender), &entry, letter.clone(), deadline);
+                self.submit_one(now, (submission, sender), &entry, letter.clone(), deadline);
             }
         }
         self.send_failures(now);
@@ -202,7 +202,7 @@ impl Core {
     /// Ends a letter whose receivers were not resolved.
     pub(super) fn fail_unresolved(&mut self, letter: Unresolved, reason: FailureReason) {
         self.table.actions.push_back(Action::Resolved {
-            send: letter.send,
+            submission: letter.submission,
             outcomes: letter.receivers.len(),
         });
         self.fail_receivers(letter, reason);
@@ -210,14 +210,14 @@ impl Core {
 
     fn fail_receivers(&mut self, letter: Unresolved, reason: FailureReason) {
         let Unresolved {
-            send,
+            submission,
             sender,
             letter,
             receivers,
             ..
         } = letter;
         for receiver in receivers {
-            self.undeliverable(send, sender, receiver, letter.clone(), reason);
+            self.undeliverable(submission, sender, receiver, letter.clone(), reason);
         }
     }
 
@@ -231,9 +231,12 @@ impl Core {
             });
         }
         while let Some(letter) = self.waiting.pop(number) {
-            let send = letter.send;
+            let submission = letter.submission;
             if let Ok(outcomes) = self.resolve(now, letter, true) {
-                let resolved = Action::Resolved { send, outcomes };
+                let resolved = Action::Resolved {
+                    submission,
+                    outcomes,
+                };
                 self.table.actions.push_back(resolved);
             }
         }
@@ -242,20 +245,20 @@ impl Core {
 
     /// Sends a letter to exactly this registration of an agent; the receivers in the submission are
     /// ignored. One outcome follows under this ID.
-    pub fn submit_to(&mut self, now: Now, submission: Submission, entry: &Entry) -> SubmissionId {
-        let send = SubmissionId(self.next_send);
-        self.next_send += 1;
-        let deadline = now.instant + submission.deadline.min(MAX_DEADLINE);
-        let sending = (send, submission.sender);
-        self.submit_one(now, sending, entry, submission.letter, deadline);
+    pub fn submit_to(&mut self, now: Now, submitted: Submission, entry: &Entry) -> SubmissionId {
+        let submission = SubmissionId(self.next_submission);
+        self.next_submission += 1;
+        let deadline = now.instant + submitted.deadline.min(MAX_DEADLINE);
+        let sending = (submission, submitted.sender);
+        self.submit_one(now, sending, entry, submitted.letter, deadline);
         self.send_failures(now);
-        send
+        submission
     }
 
     fn submit_one(
         &mut self,
         now: Now,
-        (send, sender): (SubmissionId, Incarnation),
+        (submission, sender): (SubmissionId, Incarnation),
         entry: &Entry,
         letter: Letter,
         deadline: Instant,
@@ -264,22 +267,22 @@ impl Core {
         let name = &entry.name;
         if self.closed {
             let reason = FailureReason::Closed;
-            return self.undeliverable(send, sender, Arc::clone(name), letter, reason);
+            return self.undeliverable(submission, sender, Arc::clone(name), letter, reason);
         }
         let lane = self.lane(now, own_lane(sender, entry), name);
         if !self.holds_back(now, lane, letter.len()) {
             let reason = FailureReason::QueueFull;
-            return self.undeliverable(send, sender, Arc::clone(name), letter, reason);
+            return self.undeliverable(submission, sender, Arc::clone(name), letter, reason);
         }
         let sequence = self.sequence_of(sender);
         self.table.notice(stream, sequence, name, || News::Sent {
-            send: Some(send),
+            submission: Some(submission),
             letter: letter.clone(),
         });
-        let origin = Origin::Local { send };
+        let origin = Origin::Local { submission };
         let letter_of = (stream.receiver, sequence);
-        let delivery = OpenLetter::new(now.instant, origin, letter, letter_of, deadline);
-        self.put(now, lane, delivery);
+        let open_letter = OpenLetter::new(now.instant, origin, letter, letter_of, deadline);
+        self.put(now, lane, open_letter);
     }
 
     /// Fails a letter for an agent that cannot be reached at any of its addresses. `attempts` has the reason for
@@ -291,30 +294,30 @@ impl Core {
         receiver: Arc<str>,
         attempts: Vec<Attempt>,
     ) -> SubmissionId {
-        let send = SubmissionId(self.next_send);
-        self.next_send += 1;
+        let submission = SubmissionId(self.next_submission);
+        self.next_submission += 1;
         let reason = FailureReason::NoSuchAgent;
-        self.failed(send, sender, receiver, letter, (reason, attempts));
+        self.failed(submission, sender, receiver, letter, (reason, attempts));
         self.send_failures(now);
-        send
+        submission
     }
 
     /// Fails a letter to an agent that the directory does not list.
     pub(super) fn absent(
         &mut self,
-        send: SubmissionId,
+        submission: SubmissionId,
         sender: Incarnation,
         receiver: Arc<str>,
         letter: Letter,
     ) {
         let (reason, attempt) = self.table.absence(&receiver);
         let why = (reason, attempt.into_iter().collect());
-        self.failed(send, sender, receiver, letter, why);
+        self.failed(submission, sender, receiver, letter, why);
     }
 
     pub(super) fn failed(
         &mut self,
-        send: SubmissionId,
+        submission: SubmissionId,
         sender: Incarnation,
         receiver: Arc<str>,
         letter: Letter,
@@ -327,7 +330,7 @@ impl Core {
         let stream = Stream::between(sender, Incarnation::UNKNOWN);
         self.table
             .notice(stream, sequence, &receiver, || News::Sent {
-                send: Some(send),
+                submission: Some(submission),
                 letter: letter.clone(),
             });
         self.table
@@ -343,7 +346,7 @@ impl Core {
             detail,
         });
         self.table.actions.push_back(Action::Outcome {
-            send,
+            submission,
             receiver,
             outcome,
         });
@@ -351,13 +354,13 @@ impl Core {
 
     fn undeliverable(
         &mut self,
-        send: SubmissionId,
+        submission: SubmissionId,
         sender: Incarnation,
         receiver: Arc<str>,
         letter: Letter,
         reason: FailureReason,
     ) {
-        self.failed(send, sender, receiver, letter, (reason, Vec::new()));
+        self.failed(submission, sender, receiver, letter, (reason, Vec::new()));
     }
 
     pub(super) fn sequence_of(&mut self, sender: Incarnation) -> u64 {

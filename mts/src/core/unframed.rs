@@ -229,13 +229,13 @@ fn receivers_of(name: Arc<str>, resolution: Resolution) -> Vec<Receiver> {
         }
         Resolution::None => (Vec::new(), Vec::new()),
     };
-    let here = entries.into_iter();
-    let mut here = here.filter(|entry| entry.reach == Reach::Local).peekable();
-    if here.peek().is_none() && missing.is_empty() {
+    let local = entries.into_iter();
+    let mut agents = local.filter(|entry| entry.reach == Reach::Local).peekable();
+    if agents.peek().is_none() && missing.is_empty() {
         missing.push(name);
     }
     let missing = missing.into_iter().map(Receiver::Unknown);
-    missing.chain(here.map(Receiver::Here)).collect()
+    missing.chain(agents.map(Receiver::Here)).collect()
 }
 
 /// The reason why a legacy peer's letter to these receivers is refused, if it is.
@@ -402,8 +402,8 @@ impl Core {
         }
         let origin = Origin::LegacyPeer { from, failed };
         let letter_of = (stream.receiver, sequence);
-        let delivery = OpenLetter::new(now.instant, origin, letter.clone(), letter_of, until);
-        self.put(now, lane, delivery);
+        let open_letter = OpenLetter::new(now.instant, origin, letter.clone(), letter_of, until);
+        self.put(now, lane, open_letter);
     }
 
     /// Reports that a legacy peer's letter cannot be delivered to this receiver.

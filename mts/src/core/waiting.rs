@@ -15,7 +15,7 @@ use crate::Map;
 /// A letter that was sent and whose receivers are to be resolved.
 #[derive(Debug)]
 pub(super) struct Unresolved {
-    pub(super) send: SubmissionId,
+    pub(super) submission: SubmissionId,
     pub(super) sender: Incarnation,
     pub(super) letter: Letter,
     pub(super) receivers: Vec<Arc<str>>,
@@ -62,7 +62,7 @@ impl WaitingLetters {
             return None;
         }
         let (_, letter) = self.letters.pop_front()?;
-        self.left(&letter);
+        self.uncount(&letter);
         Some(letter)
     }
 
@@ -74,7 +74,7 @@ impl WaitingLetters {
         self.letters = stay;
         let gone: Vec<Unresolved> = gone.into_iter().map(|(_, letter)| letter).collect();
         for letter in &gone {
-            self.left(letter);
+            self.uncount(letter);
         }
         gone
     }
@@ -84,7 +84,7 @@ impl WaitingLetters {
         self.letters.iter().map(|(_, letter)| letter.deadline).min()
     }
 
-    fn left(&mut self, letter: &Unresolved) {
+    fn uncount(&mut self, letter: &Unresolved) {
         if let Some((letters, bytes)) = self.senders.get_mut(&letter.sender) {
             *letters -= 1;
             *bytes -= letter.letter.len();

@@ -69,19 +69,19 @@ impl fmt::Debug for RuntimeConfig {
 /// Receives news about other hosts: services with an open connection, and agents that are in no
 /// directory.
 pub trait Contacts: Send + Sync {
-    /// A letter from an agent behind this location has arrived; see [`Action::Heard`]. Called with the service
+    /// A letter from an agent behind this location has arrived; see [`Action::ContactSeen`]. Called with the service
     /// locked; must not block. `host` is the host name that it states, if its location has an address instead.
-    fn heard(&self, name: &str, agent: Incarnation, location: Location, host: Option<&str>);
+    fn contact_seen(&self, name: &str, agent: Incarnation, location: Location, host: Option<&str>);
 
-    /// A known agent has sent another letter; see [`Action::HeardAgain`]. Called with the service locked; must not
+    /// A known agent has sent another letter; see [`Action::ContactSeenAgain`]. Called with the service locked; must not
     /// block.
-    fn heard_again(&self, name: &str);
+    fn contact_seen_again(&self, name: &str);
 
     /// An agent of a legacy peer has taken a letter; see [`Action::Taken`]. Called with the service locked; must
     /// not block.
     fn took(&self, name: &str, location: &Location);
 
-    /// Publishes the agents of [`heard`](Self::heard) to the processes of this host. Called without the service
+    /// Publishes the agents of [`contact_seen`](Self::contact_seen) to the processes of this host. Called without the service
     /// locked, because it may write files.
     fn publish(&self);
 
@@ -92,8 +92,8 @@ pub trait Contacts: Send + Sync {
     /// [`Sink::introduced`](fipa_transport::Sink::introduced).
     fn introduced(&self, peer: &Introduction);
 
-    /// A connection has ended; see [`Sink::parted`](fipa_transport::Sink::parted).
-    fn parted(&self, peer: &Introduction);
+    /// A connection has ended; see [`Sink::disconnected`](fipa_transport::Sink::disconnected).
+    fn disconnected(&self, peer: &Introduction);
 }
 
 /// Maximum time for which a service that closes waits until other services confirm its reports about
@@ -174,7 +174,7 @@ struct Shared {
 #[derive(Default)]
 struct Unlocked {
     /// Whether contacts are to be published before the directory is refreshed.
-    has_heard: bool,
+    has_new_contacts: bool,
     /// Number of the last refresh of the directory that the core has requested.
     refresh: Option<u64>,
 }
@@ -189,7 +189,7 @@ struct State {
     unframed_deadline: Duration,
     /// Time at which the timer wakes up.
     armed: Option<Instant>,
-    sends: Map<SubmissionId, Arc<Slot>>,
+    submissions: Map<SubmissionId, Arc<Slot>>,
     agents: Map<Incarnation, Arc<AgentWaiter>>,
 }
 
@@ -276,7 +276,7 @@ impl Mts {
             replaced: Vec::new(),
             unframed_deadline: config.unframed_deadline,
             armed: None,
-            sends: Map::default(),
+            submissions: Map::default(),
             agents: Map::default(),
         };
         let shared = Arc::new(Shared {
@@ -334,10 +334,10 @@ impl Mts {
     }
 
     /// Opens connections to these services, by name and location, so that their greetings announce
-    /// this service's locations; see [`Core::greet`].
-    pub fn greet(&self, services: Vec<(Arc<str>, Location)>) {
+    /// this service's locations; see [`Core::announce_locations`].
+    pub fn announce_locations(&self, services: Vec<(Arc<str>, Location)>) {
         let mut state = self.shared.lock();
-        state.core.greet(services);
+        state.core.announce_locations(services);
         self.shared.carry_out(state);
     }
 
@@ -436,7 +436,7 @@ impl Mts {
             complete: Notify::new(),
         });
         if expected > 0 {
-            state.sends.insert(id, Arc::clone(&slot));
+            state.submissions.insert(id, Arc::clone(&slot));
         }
         self.shared.carry_out(state);
         if expected <= FEW_OUTCOMES {
@@ -716,7 +716,7 @@ impl Shared {
     ) {
         let mut rest = self.perform(guard, release);
         while let Some(number) = rest.refresh {
-            if rest.has_heard
+            if rest.has_new_contacts
                 && let Some(contacts) = &self.config.contacts
             {
                 contacts.publish();
@@ -777,32 +777,32 @@ impl Shared {
                     }
                 }
                 Action::Outcome {
-                    send,
+                    submission,
                     receiver,
                     outcome,
                 } => {
-                    state.outcome(send, receiver, outcome);
+                    state.outcome(submission, receiver, outcome);
                 }
                 Action::Suspect { location, fault } => {
                     if let Some(contacts) = &self.config.contacts {
                         contacts.suspect(&location, fault);
                     }
                 }
-                Action::Heard {
+                Action::ContactSeen {
                     name,
                     agent,
                     location,
                     host,
                 } => {
                     if let Some(contacts) = &self.config.contacts {
-                        contacts.heard(&name, agent, location, host.as_deref());
+                        contacts.contact_seen(&name, agent, location, host.as_deref());
                         state.update_view(&*self.directory);
-                        rest.has_heard = true;
+                        rest.has_new_contacts = true;
                     }
                 }
-                Action::HeardAgain { name } => {
+                Action::ContactSeenAgain { name } => {
                     if let Some(contacts) = &self.config.contacts {
-                        contacts.heard_again(&name);
+                        contacts.contact_seen_again(&name);
                     }
                 }
                 Action::Taken { name, location } => {
@@ -812,7 +812,10 @@ impl Shared {
                 }
                 // One refresh is enough for all that were requested before it.
                 Action::Refresh { number } => rest.refresh = Some(number),
-                Action::Resolved { send, outcomes } => state.resolved(send, outcomes),
+                Action::Resolved {
+                    submission,
+                    outcomes,
+                } => state.resolved(submission, outcomes),
                 Action::Notice(notice) => {
                     if let Some(tap) = &self.config.tap {
                         tap.notice(&notice);
@@ -881,8 +884,8 @@ impl State {
         }
     }
 
-    fn resolved(&mut self, send: SubmissionId, outcomes: usize) {
-        let Some(slot) = self.sends.get(&send) else {
+    fn resolved(&mut self, submission: SubmissionId, outcomes: usize) {
+        let Some(slot) = self.submissions.get(&submission) else {
             return;
         };
         let complete = {
@@ -892,12 +895,12 @@ impl State {
         };
         if complete {
             slot.complete.notify_one();
-            self.sends.remove(&send);
+            self.submissions.remove(&submission);
         }
     }
 
-    fn outcome(&mut self, send: SubmissionId, receiver: Arc<str>, outcome: Outcome) {
-        let Some(slot) = self.sends.get(&send) else {
+    fn outcome(&mut self, submission: SubmissionId, receiver: Arc<str>, outcome: Outcome) {
+        let Some(slot) = self.submissions.get(&submission) else {
             return;
         };
         let complete = {
@@ -912,7 +915,7 @@ impl State {
         };
         if complete {
             slot.complete.notify_one();
-            self.sends.remove(&send);
+            self.submissions.remove(&submission);
         }
     }
 }
@@ -995,7 +998,7 @@ async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
         }
         let mut state = shared.lock();
         let now = state.clocks.now();
-        let mut left: Vec<Location> = Vec::new();
+        let mut vacated: Vec<Location> = Vec::new();
         for change in changes.iter().flat_map(Change::single) {
             match change {
                 Change::Left(entry) => state.core.handle_departure(now, entry),
@@ -1003,17 +1006,17 @@ async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
                     state.core.handle_departure(now, before);
                 }
                 Change::Changed { before, after } if before.locations != after.locations => {
-                    left.extend(state.core.handle_relocation(before, after));
+                    vacated.extend(state.core.handle_relocation(before, after));
                 }
                 _ => {}
             }
         }
-        left.sort_unstable();
-        left.dedup();
+        vacated.sort_unstable();
+        vacated.dedup();
         // Before the letters are sent again.
-        for location in &left {
+        for location in &vacated {
             if let Some(transport) = shared.transport(location.kind()) {
-                transport.left(location);
+                transport.location_vacated(location);
             }
         }
         state.core.handle_directory_change(now);

@@ -146,16 +146,16 @@ impl Sink for TransportSink {
         shared.carry_out(state);
     }
 
-    fn parted(&self, peer: &Introduction) {
+    fn disconnected(&self, peer: &Introduction) {
         let Some(shared) = self.shared.upgrade() else {
             return;
         };
         if let Some(contacts) = &shared.config.contacts {
-            contacts.parted(peer);
+            contacts.disconnected(peer);
         }
         let mut state = shared.lock();
         let now = state.clocks.now();
-        state.core.handle_parted(now, peer);
+        state.core.handle_disconnected(now, peer);
         shared.carry_out(state);
     }
 }

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use fipa_mts::core::rules::{self, Again, Cause, HoldDecision};
 
-use crate::hop::Heard;
+use crate::hop::Effect;
 use crate::protocol::{Mutant, Protocol};
 use crate::state::{
     CUSTODIANS, Custodian, Held, Key, LIVES, Message, PauseEnd, Place, RECEIVER, Service, State,
@@ -189,11 +189,11 @@ impl Protocol {
         };
         let after = held.after;
         let was_uncertain = held.uncertain;
-        match self.heard(message, held.place, held.handed) {
-            Heard::Nothing => {}
-            Heard::Doubt => held.uncertain = true,
-            Heard::Delivered => self.leave(state, custodian, key, |_| What::Delivered),
-            Heard::Back(cause, end) => {
+        match self.effect_of(message, held.place, held.handed) {
+            Effect::Nothing => {}
+            Effect::Doubt => held.uncertain = true,
+            Effect::Delivered => self.leave(state, custodian, key, |_| What::Delivered),
+            Effect::Back(cause, end) => {
                 let sent = match std::mem::replace(&mut held.place, Place::Ready) {
                     Place::Out { sent, .. } => sent,
                     _ => 0,
@@ -213,12 +213,12 @@ impl Protocol {
                     }
                 }
             }
-            Heard::Moved => {
+            Effect::Moved => {
                 self.leave(state, custodian, key, |uncertain| What::Returned {
                     uncertain,
                 });
             }
-            Heard::Failed(end) => {
+            Effect::Failed(end) => {
                 Self::mark(&mut held.uncertain, end);
                 if self.is(Mutant::CertainBehind) {
                     held.uncertain = was_uncertain;
@@ -236,8 +236,8 @@ impl Protocol {
             return;
         };
         let after = held.after;
-        let here = Self::holds(state, custodian, key.registration, after);
-        match rules::hold(here, TIMEOUT, TIMEOUT) {
+        let holds = Self::holds(state, custodian, key.registration, after);
+        match rules::hold(holds, TIMEOUT, TIMEOUT) {
             HoldDecision::ForPredecessor | HoldDecision::For(_) => {}
             HoldDecision::Return if self.is(Mutant::NeverReturn) => {}
             HoldDecision::Return => {

@@ -9,7 +9,7 @@ use crate::state::{
 };
 
 /// The meaning of an answer or a report to the service that handed the letter over.
-pub(crate) enum Heard {
+pub(crate) enum Effect {
     Nothing,
     /// It may have been delivered by an earlier hand-over.
     Doubt,
@@ -81,44 +81,44 @@ impl Protocol {
     }
 
     /// Returns the meaning of an answer or a report to a service that holds the letter.
-    pub(crate) fn heard(&self, message: Message, place: Place, handed: u8) -> Heard {
+    pub(crate) fn effect_of(&self, message: Message, place: Place, handed: u8) -> Effect {
         let current = match place {
             Place::Out { transfer, .. } => Some(transfer.into()),
             _ => None,
         };
         let answers = matches!(place, Place::Out { to, transfer, .. }
             if to == message.from && transfer == message.transfer);
-        let told = match message.what {
+        let report = match message.what {
             What::Delivered => CustodyReport::Delivered,
             What::Failed { uncertain } | What::Returned { uncertain } => {
                 CustodyReport::NotDelivered { uncertain }
             }
-            _ if !answers => return Heard::Nothing,
-            What::Accepted => return Heard::Delivered,
+            _ if !answers => return Effect::Nothing,
+            What::Accepted => return Effect::Delivered,
             What::OutOfOrder { last } => {
                 let last = last.into();
-                return Heard::Back(Cause::OutOfOrder { last }, AttemptEnd::NotTaken);
+                return Effect::Back(Cause::OutOfOrder { last }, AttemptEnd::NotTaken);
             }
-            What::Busy => return Heard::Back(Cause::Busy, AttemptEnd::NotTaken),
-            What::Refused => return Heard::Failed(AttemptEnd::NotTaken),
-            What::Gone => return Heard::Moved,
-            What::Copy { .. } | What::Predecessor { .. } => return Heard::Nothing,
+            What::Busy => return Effect::Back(Cause::Busy, AttemptEnd::NotTaken),
+            What::Refused => return Effect::Failed(AttemptEnd::NotTaken),
+            What::Gone => return Effect::Moved,
+            What::Copy { .. } | What::Predecessor { .. } => return Effect::Nothing,
         };
         let handed = handed & message.from.bit() != 0;
-        let mut belief = rules::believe(handed, told, message.transfer.into(), current);
+        let mut belief = rules::believe(handed, report, message.transfer.into(), current);
         if self.is(Mutant::BelieveAny) && handed {
             belief = Belief::Believed;
         }
-        let end = match told {
+        let end = match report {
             CustodyReport::NotDelivered { uncertain: true } => AttemptEnd::Unknown,
             _ => AttemptEnd::NotTaken,
         };
         match (belief, message.what) {
-            (Belief::Ignored, _) => Heard::Nothing,
-            (Belief::OnlyUncertain, _) => Heard::Doubt,
-            (Belief::Believed, What::Delivered) => Heard::Delivered,
-            (Belief::Believed, What::Failed { .. }) => Heard::Failed(end),
-            (Belief::Believed, _) => Heard::Back(Cause::Returned, end),
+            (Belief::Ignored, _) => Effect::Nothing,
+            (Belief::OnlyUncertain, _) => Effect::Doubt,
+            (Belief::Believed, What::Delivered) => Effect::Delivered,
+            (Belief::Believed, What::Failed { .. }) => Effect::Failed(end),
+            (Belief::Believed, _) => Effect::Back(Cause::Returned, end),
         }
     }
 

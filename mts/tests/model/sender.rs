@@ -2,7 +2,7 @@
 
 use fipa_mts::core::rules::{self, Again, Cause};
 
-use crate::hop::Heard;
+use crate::hop::Effect;
 use crate::protocol::{Mutant, Protocol};
 use crate::state::{Key, Letter, Message, Outcome, Place, RECEIVER, SENDER, State, What};
 
@@ -49,13 +49,13 @@ impl Protocol {
                 to,
                 transfer,
                 sent,
-                after: told,
+                after: lowered,
             } = letter.place
             else {
                 continue;
             };
             let after = self.predecessor_by_name(state, later);
-            if letter.outcome.is_some() || after >= told || to == RECEIVER {
+            if letter.outcome.is_some() || after >= lowered || to == RECEIVER {
                 continue;
             }
             let letter = &mut state.letters[usize::from(later) - 1];
@@ -134,11 +134,11 @@ impl Protocol {
         if letter.outcome.is_some() || letter.registration != message.key.registration {
             return;
         }
-        match self.heard(message, letter.place, letter.handed) {
-            Heard::Nothing => {}
-            Heard::Doubt => letter.uncertain = true,
-            Heard::Delivered => self.conclude(state, sequence, Outcome::Delivered),
-            Heard::Back(cause, end) => {
+        match self.effect_of(message, letter.place, letter.handed) {
+            Effect::Nothing => {}
+            Effect::Doubt => letter.uncertain = true,
+            Effect::Delivered => self.conclude(state, sequence, Outcome::Delivered),
+            Effect::Back(cause, end) => {
                 let sent = match std::mem::replace(&mut letter.place, Place::Ready) {
                     Place::Out { sent, .. } => sent,
                     _ => 0,
@@ -157,8 +157,8 @@ impl Protocol {
                     }
                 }
             }
-            Heard::Moved => letter.place = Place::Moved,
-            Heard::Failed(end) => {
+            Effect::Moved => letter.place = Place::Moved,
+            Effect::Failed(end) => {
                 Self::mark(&mut letter.uncertain, end);
                 self.fail(state, sequence);
             }

@@ -97,10 +97,10 @@ impl World {
 
     /// The agent of this name that a running process of this host has now.
     pub(super) fn agent_on(&self, host: usize, name: &str) -> Option<Incarnation> {
-        let here = |at: &usize| self.processes[*at].host == host;
+        let is_here = |at: &usize| self.processes[*at].host == host;
         let mut agents = self
             .robots()
-            .filter(here)
+            .filter(is_here)
             .flat_map(|at| &self.processes[at].agents);
         agents.find(|(other, _)| **other == *name).map(|it| it.1)
     }
@@ -320,10 +320,10 @@ impl World {
                 format!("{per_byte} steps for each byte, {most} for one arrival")
             });
         }
-        let told = self.failures_told;
-        if self.forecast.is_calm() && !self.forecast.liars && failed != told {
+        let reported = self.failures_told;
+        if self.forecast.is_calm() && !self.forecast.liars && failed != reported {
             self.breach(Invariant::Calm, || {
-                format!("{failed} failures, {told} reported")
+                format!("{failed} failures, {reported} reported")
             });
         }
         let mut living = self.processes.iter().filter(|process| process.alive);

@@ -139,7 +139,7 @@ impl World {
                 since: self.now,
                 ended: None,
                 known: known.clone(),
-                left: Vec::new(),
+                left_at: Vec::new(),
             });
         }
         self.liars = Some(Liars {
@@ -186,7 +186,7 @@ impl World {
         let introduction = self.introduction_of(gone);
         for (at, process) in self.processes.iter_mut().enumerate() {
             if process.alive && self.met.contains(&(at, gone)) {
-                process.core.handle_parted(now, &introduction);
+                process.core.handle_disconnected(now, &introduction);
             }
         }
     }
@@ -576,14 +576,15 @@ impl World {
         let now = self.clocks();
         let ended = self.random.u32(..3) == 0;
         let known = self.liars.as_mut().and_then(|liars| {
-            let here = liars.introduced.iter().position(|(at, _)| *at == target);
-            here.filter(|_| ended)
+            let place = liars.introduced.iter().position(|(at, _)| *at == target);
+            place
+                .filter(|_| ended)
                 .map(|it| liars.introduced.swap_remove(it).1)
         });
         if let Some(introduction) = known {
             self.processes[target]
                 .core
-                .handle_parted(now, &introduction);
+                .handle_disconnected(now, &introduction);
             return self.carry_out(target);
         }
         let mut service = match self.random.bool() {

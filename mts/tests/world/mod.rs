@@ -431,7 +431,7 @@ impl World {
                 since: self.now,
                 ended: None,
                 known: known.to_vec(),
-                left: Vec::new(),
+                left_at: Vec::new(),
             });
         }
         let at = self.processes.len();
@@ -446,11 +446,11 @@ impl World {
             true => (w.refused_by_gateways, host as u64),
             false => (w.refused_by_receivers, 1000),
         };
-        let here = self.denied.iter().filter(|(at, _)| gateway && *at == host);
+        let denied = self.denied.iter().filter(|(at, _)| gateway && *at == host);
         Rules {
             seed: self.seed.wrapping_mul(4099).wrapping_add(place),
             share,
-            denied: here.map(|(_, denied)| denied.clone()).collect(),
+            denied: denied.map(|(_, denied)| denied.clone()).collect(),
             rate: (gateway && w.rate > 0.0).then_some((w.rate, self.heals)),
             strangers: w.reading_pause_ms == 1,
             taken: Mutex::default(),
@@ -590,13 +590,13 @@ impl World {
                 Action::Abandon { attempt, error, .. } => self.abandon(at, attempt, error),
                 Action::Answer { ticket, answer, .. } => self.answer(at, ticket, answer),
                 Action::Outcome {
-                    send,
+                    submission,
                     receiver,
                     outcome,
-                } => self.outcome((at, send), receiver, outcome)?,
+                } => self.outcome((at, submission), receiver, outcome)?,
                 // Every process knows all others here.
-                Action::Heard { .. }
-                | Action::HeardAgain { .. }
+                Action::ContactSeen { .. }
+                | Action::ContactSeenAgain { .. }
                 | Action::Taken { .. }
                 | Action::Suspect { .. } => {}
                 Action::Notice(notice) => {
@@ -614,7 +614,10 @@ impl World {
                         }
                     }
                 }
-                Action::Resolved { send, outcomes } => self.resolved((at, send), outcomes),
+                Action::Resolved {
+                    submission,
+                    outcomes,
+                } => self.resolved((at, submission), outcomes),
                 Action::Deliverable { agent } => {
                     if self.reading.insert(agent) {
                         self.after_ms(1 + self.weather.reading_pause_ms, Event::Read { at, agent });

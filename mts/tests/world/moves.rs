@@ -87,7 +87,7 @@ impl World {
             since: self.now,
             ended: None,
             known: known.clone(),
-            left: Vec::new(),
+            left_at: Vec::new(),
         });
         self.tell(&known, Vec::new(), &[]);
         Ok(())
@@ -115,9 +115,9 @@ impl World {
                 Reach::Local => false,
             });
             let is_told = |entry: &Entry| {
-                departed
-                    .iter()
-                    .any(|(by, told)| *by == at && told.incarnation == entry.incarnation)
+                departed.iter().any(|(by, entry_of_other)| {
+                    *by == at && entry_of_other.incarnation == entry.incarnation
+                })
             };
             late.extend(
                 left.filter(|entry| !is_told(entry))

@@ -146,9 +146,9 @@ impl World {
         };
         let now = self.clocks();
         let missed = known.is_none();
-        let here = self.agent_on(self.processes[at].host, receiver);
-        let (send, expected) = self.processes[at].core.submit(now, submission);
-        self.sends.insert((at, send), number);
+        let on_host = self.agent_on(self.processes[at].host, receiver);
+        let (submission, expected) = self.processes[at].core.submit(now, submission);
+        self.sends.insert((at, submission), number);
         let bound = Some(self.bound(size))
             .filter(|bound| self.now >= self.quiet && known.is_some() && deadline > *bound)
             .filter(|_| !self.is_liars_name(receiver));
@@ -169,7 +169,7 @@ impl World {
                 receivers,
                 known,
                 expected: expected.unwrap_or(usize::MAX),
-                missed: here.filter(|_| missed),
+                missed: on_host.filter(|_| missed),
                 outcomes: BTreeMap::new(),
                 at: self.now,
                 deadline,
@@ -199,8 +199,8 @@ impl World {
     }
 
     /// The receivers of a letter are known after a refresh.
-    pub(super) fn resolved(&mut self, (at, send): (usize, SubmissionId), outcomes: usize) {
-        let Some(&number) = self.sends.get(&(at, send)) else {
+    pub(super) fn resolved(&mut self, (at, submission): (usize, SubmissionId), outcomes: usize) {
+        let Some(&number) = self.sends.get(&(at, submission)) else {
             return;
         };
         self.trace(|| format!("letter {number} has {outcomes} receivers"));

@@ -37,7 +37,7 @@ pub(super) struct Registered {
     /// Time at which each host learns of it.
     pub(super) known: Vec<Instant>,
     /// Time at which each host learns of its end, once it has ended.
-    pub(super) left: Vec<Instant>,
+    pub(super) left_at: Vec<Instant>,
 }
 
 /// Two locations: kind, service, and number of the address.
@@ -52,7 +52,7 @@ struct Readdressed {
 impl Registered {
     fn is_seen(&self, host: usize, now: Option<Instant>) -> bool {
         let past = |times: &[Instant]| times.get(host).is_some_and(|at| now >= Some(*at));
-        past(&self.known) && !past(&self.left)
+        past(&self.known) && !past(&self.left_at)
     }
 }
 
@@ -82,7 +82,7 @@ impl Registry {
                 .refreshed
                 .get(&view.mts)
                 .is_some_and(|at| *at >= registered.since);
-        registered.host == view.host && registered.left.is_empty() && has_read
+        registered.host == view.host && registered.left_at.is_empty() && has_read
     }
 
     pub(super) fn register(&mut self, registered: Registered) {
@@ -97,9 +97,9 @@ impl Registry {
     }
 
     /// Ends this registration, which each host learns at its own time.
-    pub(super) fn end(&mut self, incarnation: Incarnation, left: &[Instant]) {
+    pub(super) fn end(&mut self, incarnation: Incarnation, left_at: &[Instant]) {
         if let Some(place) = self.by_incarnation.get(&incarnation) {
-            self.entries[*place].left = left.to_vec();
+            self.entries[*place].left_at = left_at.to_vec();
             self.entries[*place].ended = self.now;
         }
     }
@@ -130,8 +130,8 @@ impl Registry {
             .iter()
             .rev()
             .map(|place| &self.entries[*place]);
-        let mut here = gateways.filter(|gateway| gateway.host == host);
-        let found = here.find(|gateway| gateway.is_seen(seen_from, self.now))?;
+        let mut gateways = gateways.filter(|gateway| gateway.host == host);
+        let found = gateways.find(|gateway| gateway.is_seen(seen_from, self.now))?;
         Some(found.mts)
     }
 }

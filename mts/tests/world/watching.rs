@@ -55,7 +55,7 @@ impl Watching {
             ));
         }
         // For senders of this host, which report the sending.
-        if passage.send.is_some() && !later {
+        if passage.submission.is_some() && !later {
             let last = self.last.insert(sender, passage.sequence).unwrap_or(0);
             if last >= passage.sequence {
                 return Err(format!("{passage:?} was seen after the letter {last}"));
@@ -91,10 +91,12 @@ impl World {
                 let outcome = match (&passage.fate, passage.via) {
                     (Fate::Settled(outcome), _) => outcome.clone(),
                     // The sender got the same outcome, or there would have been another event.
-                    (Fate::Taken, Some(via)) if passage.send.is_some() => Outcome::Delivered {
-                        via,
-                        attempts: Vec::new(),
-                    },
+                    (Fate::Taken, Some(via)) if passage.submission.is_some() => {
+                        Outcome::Delivered {
+                            via,
+                            attempts: Vec::new(),
+                        }
+                    }
                     _ => continue,
                 };
                 let Some(number) = number_in(&passage.content) else {

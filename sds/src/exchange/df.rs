@@ -52,15 +52,19 @@ pub(super) type DfEntries = BTreeMap<Arc<str>, Arc<DfEntry>>;
 
 impl OwnDfEntry {
     /// Returns the entry as part of a letter, unless its lease has ended.
-    pub(super) fn told(&self, now: Instant) -> Option<wire::DfEntry> {
-        let left = self.lease.map(|ends| ends.saturating_duration_since(now));
-        if left.is_some_and(|left| left.is_zero()) {
+    pub(super) fn to_wire(&self, now: Instant) -> Option<wire::DfEntry> {
+        let time_left = self.lease.map(|ends| ends.saturating_duration_since(now));
+        if time_left.is_some_and(|time_left| time_left.is_zero()) {
             return None;
         }
-        let millis = |left: Duration| u64::try_from(left.as_millis()).unwrap_or(u64::MAX).max(1);
+        let millis = |time_left: Duration| {
+            u64::try_from(time_left.as_millis())
+                .unwrap_or(u64::MAX)
+                .max(1)
+        };
         Some(wire::DfEntry {
             entry: self.text.to_string(),
-            lease: left.map(millis),
+            lease: time_left.map(millis),
         })
     }
 
@@ -82,22 +86,24 @@ impl DfEntry {
         now: Instant,
         (gateway, principal): (Incarnation, Principal),
         (name, incarnation): (&Arc<str>, Incarnation),
-        told: wire::DfEntry,
+        received: wire::DfEntry,
     ) -> Option<Arc<Self>> {
-        let left = told.lease.map(Duration::from_millis);
-        if told.entry.len() > Exchange::MAX_DF_ENTRY || left.is_some_and(|left| left.is_zero()) {
+        let time_left = received.lease.map(Duration::from_millis);
+        if received.entry.len() > Exchange::MAX_DF_ENTRY
+            || time_left.is_some_and(|time_left| time_left.is_zero())
+        {
             return None;
         }
-        let lease = left.map_or(Exchange::MAX_DF_LEASE, |left| {
-            left.min(Exchange::MAX_DF_LEASE)
+        let lease = time_left.map_or(Exchange::MAX_DF_LEASE, |time_left| {
+            time_left.min(Exchange::MAX_DF_LEASE)
         });
         Some(Arc::new(Self {
             name: Arc::clone(name),
             incarnation,
             gateway,
             principal,
-            text: told.entry.into(),
-            has_lease: left.is_some(),
+            text: received.entry.into(),
+            has_lease: time_left.is_some(),
             ends: now + lease,
         }))
     }
@@ -106,17 +112,17 @@ impl DfEntry {
 /// Keeps the entries that are sent: the first ones, as far as the bounds allow. Returns the names of the
 /// others.
 pub(super) fn bounded(entries: Vec<OwnDfEntry>) -> (BTreeMap<Arc<str>, OwnDfEntry>, Vec<Arc<str>>) {
-    let (mut kept, mut others, mut used) = (BTreeMap::new(), Vec::new(), Use::default());
+    let (mut admitted, mut others, mut used) = (BTreeMap::new(), Vec::new(), Use::default());
     for entry in entries {
         let with = used.with(entry.text.len());
         if entry.text.len() <= Exchange::MAX_DF_ENTRY && with.is_within(Use::OF_GATEWAY) {
             used = with;
-            kept.insert(Arc::clone(&entry.name), entry);
+            admitted.insert(Arc::clone(&entry.name), entry);
         } else {
             others.push(entry.name);
         }
     }
-    (kept, others)
+    (admitted, others)
 }
 
 /// A number of entries, and the bytes of their texts.
@@ -267,13 +273,13 @@ mod tests {
 
     fn entry(gateway: u64, number: usize, bytes: usize) -> (Arc<str>, Option<Arc<DfEntry>>) {
         let name: Arc<str> = format!("agent-{gateway}-{number}").into();
-        let told = wire::DfEntry {
+        let received = wire::DfEntry {
             entry: "x".repeat(bytes),
             lease: None,
         };
         let agent = (&name, Incarnation::from_u64(1));
         let of = (Incarnation::from_u64(gateway), Principal::Unproved);
-        let entry = DfEntry::read(Instant::now(), of, agent, told);
+        let entry = DfEntry::read(Instant::now(), of, agent, received);
         (name, entry)
     }
 
@@ -335,47 +341,47 @@ mod tests {
         };
         let too_long = own(0, Exchange::MAX_DF_ENTRY + 1);
         let many = (1..300).map(|number| own(number, 10));
-        let (kept, others) = bounded([too_long].into_iter().chain(many).collect());
-        assert_eq!(kept.len(), Exchange::MAX_DF_ENTRIES);
-        assert!(kept.contains_key("agent-1"));
+        let (admitted, others) = bounded([too_long].into_iter().chain(many).collect());
+        assert_eq!(admitted.len(), Exchange::MAX_DF_ENTRIES);
+        assert!(admitted.contains_key("agent-1"));
         assert_eq!(others.len(), 300 - Exchange::MAX_DF_ENTRIES);
         assert_eq!(&*others[0], "agent-0");
-        let (kept, _) = bounded((0..100).map(|it| own(it, Exchange::MAX_DF_ENTRY)).collect());
-        let bytes: usize = kept.values().map(|entry| entry.text.len()).sum();
+        let (admitted, _) = bounded((0..100).map(|it| own(it, Exchange::MAX_DF_ENTRY)).collect());
+        let bytes: usize = admitted.values().map(|entry| entry.text.len()).sum();
         assert_eq!(bytes, Exchange::MAX_DF_BYTES);
     }
 
     #[test]
     fn leases_travel_as_the_time_that_is_left_and_are_capped() {
         let now = Instant::now();
-        let own = |left: Option<Duration>| OwnDfEntry {
+        let own = |time_left: Option<Duration>| OwnDfEntry {
             name: "a".into(),
             incarnation: Incarnation::from_u64(1),
             text: "x".into(),
-            lease: left.map(|left| now + left),
+            lease: time_left.map(|time_left| now + time_left),
         };
-        let read = |told| {
+        let read = |received_entry| {
             let agent = (&"a".into(), Incarnation::from_u64(1));
             let of = (Incarnation::from_u64(2), Principal::Unproved);
-            DfEntry::read(now, of, agent, told)
+            DfEntry::read(now, of, agent, received_entry)
         };
-        let received = |left| read(own(left).told(now)?);
+        let received = |time_left| read(own(time_left).to_wire(now)?);
         let second = Duration::from_secs(1);
         let entry = received(Some(second)).unwrap();
         assert_eq!((entry.has_lease, entry.ends), (true, now + second));
         assert_eq!(received(Some(Duration::ZERO)), None);
-        for (left, has_lease) in [(None, false), (Some(second * 1_000_000), true)] {
-            let entry = received(left).unwrap();
+        for (time_left, has_lease) in [(None, false), (Some(second * 1_000_000), true)] {
+            let entry = received(time_left).unwrap();
             assert_eq!(entry.has_lease, has_lease);
             assert_eq!(entry.ends, now + Exchange::MAX_DF_LEASE);
         }
-        let told = |lease| wire::DfEntry {
+        let with_lease = |lease| wire::DfEntry {
             entry: String::new(),
             lease: Some(lease),
         };
-        assert_eq!(read(told(0)), None);
+        assert_eq!(read(with_lease(0)), None);
         assert_eq!(
-            read(told(u64::MAX)).unwrap().ends,
+            read(with_lease(u64::MAX)).unwrap().ends,
             now + Exchange::MAX_DF_LEASE
         );
     }
@@ -389,8 +395,8 @@ mod tests {
                 text: text.into(),
                 lease: Some(Instant::now() + Duration::from_millis(u64::MAX >> 20)),
             };
-            let told = serde_json::to_string(&own.told(Instant::now())).unwrap();
-            assert!(own.weight() >= told.len(), "{told}");
+            let on_wire = serde_json::to_string(&own.to_wire(Instant::now())).unwrap();
+            assert!(own.weight() >= on_wire.len(), "{on_wire}");
         }
     }
 }

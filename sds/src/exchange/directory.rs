@@ -222,13 +222,13 @@ impl ExchangeDirectory {
         let before = lists.insert(gateway, list);
         let now = lists.get(&gateway);
         let before = before.map(|list| list.agents).unwrap_or_default();
-        let left = before
+        let removed = before
             .into_keys()
             .filter(|name| now.is_none_or(|now| !now.agents.contains_key(name)))
             .map(|name| (origin, name, None));
-        let here = new.into_iter();
-        let here = here.map(|entry| (origin, Arc::clone(&entry.name), Some(entry)));
-        let updates: Vec<Update> = left.chain(here).collect();
+        let added = new.into_iter();
+        let added = added.map(|entry| (origin, Arc::clone(&entry.name), Some(entry)));
+        let updates: Vec<Update> = removed.chain(added).collect();
         self.update(&mut lists, updates);
         self.show(gateway);
         df.retain(|name, _| is_listed(&lists, gateway, name));
@@ -241,7 +241,7 @@ impl ExchangeDirectory {
         &self,
         sender: &Sender,
         joined: Vec<(Arc<Entry>, Option<Arc<DfEntry>>)>,
-        left: Vec<String>,
+        removed: Vec<String>,
     ) {
         let gateway = sender.gateway;
         let origin = self.origin(gateway);
@@ -251,7 +251,7 @@ impl ExchangeDirectory {
             .or_insert_with(|| AgentList::new(sender.clone()));
         let mut updates: Vec<Update> = Vec::new();
         let mut df = Vec::new();
-        for name in left.iter().filter_map(|name| list.remove(name)) {
+        for name in removed.iter().filter_map(|name| list.remove(name)) {
             df.push((Arc::clone(&name), None));
             updates.push((origin, name, None));
         }
@@ -425,8 +425,8 @@ impl View for ExchangeView {
         self.entries.all()
     }
 
-    fn lost(&self, name: &str) -> Option<Arc<Entry>> {
-        self.entries.lost(name)
+    fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
+        self.entries.lost_agent(name)
     }
 
     fn is_authority(&self, mts: Incarnation) -> bool {

@@ -56,7 +56,7 @@ pub struct Exchange {
     neighbors: HashMap<Incarnation, Neighbor>,
     /// Gateways that sent a letter before they were reported as neighbors, the latest last; they are asked
     /// for all entries later.
-    early: VecDeque<Incarnation>,
+    early_senders: VecDeque<Incarnation>,
     directory: Arc<ExchangeDirectory>,
     /// Gateways whose certificate is no longer trusted.
     withdrawn: HashMap<Incarnation, Principal>,
@@ -175,7 +175,7 @@ struct Neighbor {
     /// Time at which its agents get its present locations, if that waits.
     relocation_due: Option<Instant>,
     /// Time at which this gateway last started to send all entries.
-    told: Option<Instant>,
+    last_full_send: Option<Instant>,
     /// Whether a list that exceeds the share was logged.
     is_cut_reported: bool,
 }
@@ -267,7 +267,7 @@ impl Exchange {
         Self {
             own: LocalAgents::default(),
             neighbors: HashMap::new(),
-            early: VecDeque::new(),
+            early_senders: VecDeque::new(),
             directory: Arc::default(),
             withdrawn: HashMap::new(),
             relocated_until: HashMap::new(),
@@ -350,7 +350,7 @@ impl Exchange {
         let withdrawn = self.withdrawn.clone();
         self.neighbors
             .retain(|gateway, _| !withdrawn.contains_key(gateway));
-        self.early
+        self.early_senders
             .retain(|gateway| !withdrawn.contains_key(gateway));
         self.directory.withdraw(&withdrawn);
         self.forget_lost(|lost| withdrawn.contains_key(&lost.mts.incarnation));
@@ -368,8 +368,8 @@ impl Exchange {
         });
         for neighbor in self.neighbors.values_mut() {
             let mts = neighbor.mts.incarnation;
-            let here = present.iter().any(|it| it.mts.incarnation == mts);
-            if here {
+            let is_present = present.iter().any(|it| it.mts.incarnation == mts);
+            if is_present {
                 if neighbor.gone.take().is_some() {
                     // It may have dropped its copy in the meantime, and then requests all entries.
                     neighbor.failures = 0;
@@ -423,8 +423,12 @@ impl Exchange {
             neighbor.mandate = mandate.clone();
             neighbor.principal = *principal;
             self.directory.prove(mts.incarnation, mandate);
-            if let Some(place) = self.early.iter().position(|it| *it == mts.incarnation) {
-                self.early.remove(place);
+            if let Some(place) = self
+                .early_senders
+                .iter()
+                .position(|it| *it == mts.incarnation)
+            {
+                self.early_senders.remove(place);
                 neighbor.request_all(now);
             }
             self.neighbors.insert(mts.incarnation, neighbor);
@@ -548,18 +552,18 @@ impl Exchange {
             return Err(ExchangeError::TooLarge(content.len()));
         }
         if !self.neighbors.contains_key(&from) {
-            if !self.early.contains(&from) {
+            if !self.early_senders.contains(&from) {
                 // A peer can connect under many incarnations, which never become neighbors.
-                if self.early.len() >= Self::MAX_NEIGHBORS {
-                    self.early.pop_front();
+                if self.early_senders.len() >= Self::MAX_NEIGHBORS {
+                    self.early_senders.pop_front();
                 }
-                self.early.push_back(from);
+                self.early_senders.push_back(from);
             }
-            return Err(ExchangeError::Stranger);
+            return Err(ExchangeError::NotConnected);
         }
         let message = wire::decode(content)?;
         let Some(neighbor) = self.neighbors.get_mut(&from) else {
-            return Err(ExchangeError::Stranger);
+            return Err(ExchangeError::NotConnected);
         };
         match message {
             ExchangeMessage::Again => {
@@ -758,12 +762,12 @@ impl Exchange {
             neighbor.under_way = Some(neighbor.state.clone());
             return Some((*incarnation, wire::encode(&ExchangeMessage::Again)));
         }
-        let (told, state) = self.own.next(&neighbor.state, now);
-        if matches!(&told, ExchangeMessage::Full(full) if full.first) {
-            neighbor.told = Some(now);
+        let (message, state) = self.own.next(&neighbor.state, now);
+        if matches!(&message, ExchangeMessage::Full(full) if full.first) {
+            neighbor.last_full_send = Some(now);
         }
         neighbor.under_way = Some(state);
-        Some((*incarnation, wire::encode(&told)))
+        Some((*incarnation, wire::encode(&message)))
     }
 
     /// Returns the final letters of this gateway: their receivers and their common content.
@@ -790,7 +794,7 @@ impl LocalAgents {
     /// Replaces the agents; returns whether anything changed.
     fn replace(&mut self, agents: Agents) -> bool {
         let before = std::mem::replace(&mut self.agents, agents);
-        let left = before
+        let removed = before
             .keys()
             .filter(|name| !self.agents.contains_key(*name));
         let differs = |(name, entry): &(&Arc<str>, &Arc<Entry>)| before.get(*name) != Some(*entry);
@@ -799,7 +803,7 @@ impl LocalAgents {
             let entry = self.agents.get(*name).or_else(|| before.get(*name));
             entry.is_some_and(|entry| matches!(entry.role, Role::Coalition(_)))
         };
-        let (coalitions, agents): (Vec<_>, Vec<_>) = left.chain(other).partition(is_coalition);
+        let (coalitions, agents): (Vec<_>, Vec<_>) = removed.chain(other).partition(is_coalition);
         let any = !coalitions.is_empty() || !agents.is_empty();
         self.version += (coalitions.len() + agents.len()) as u64;
         let logged = |name: &Arc<str>, with_previous| Logged {
@@ -818,10 +822,10 @@ impl LocalAgents {
     /// Replaces the DF entries; returns whether an entry of a present agent changed.
     fn replace_df(&mut self, entries: BTreeMap<Arc<str>, OwnDfEntry>) -> bool {
         let before = std::mem::replace(&mut self.df, entries);
-        let left = before.keys().filter(|name| !self.df.contains_key(*name));
+        let removed = before.keys().filter(|name| !self.df.contains_key(*name));
         let differs = |(name, entry): &(&Arc<str>, &OwnDfEntry)| before.get(*name) != Some(*entry);
         let other = self.df.iter().filter(differs).map(|(name, _)| name);
-        let changed: Vec<Arc<str>> = left.chain(other).cloned().collect();
+        let changed: Vec<Arc<str>> = removed.chain(other).cloned().collect();
         self.log_df(changed)
     }
 
@@ -852,8 +856,8 @@ impl LocalAgents {
     }
 
     /// Returns an agent as part of a letter.
-    fn told(&self, entry: &Arc<Entry>, now: Instant) -> wire::Agent {
-        let df = self.df_of(entry).and_then(|own| own.told(now));
+    fn to_wire(&self, entry: &Arc<Entry>, now: Instant) -> wire::Agent {
+        let df = self.df_of(entry).and_then(|own| own.to_wire(now));
         wire::Agent::of(entry, df)
     }
 
@@ -925,7 +929,7 @@ impl LocalAgents {
             last,
             agents: batch
                 .into_iter()
-                .map(|entry| self.told(entry, now))
+                .map(|entry| self.to_wire(entry, now))
                 .collect(),
         };
         (ExchangeMessage::Full(full), state)
@@ -960,9 +964,9 @@ impl LocalAgents {
             agents: names
                 .iter()
                 .filter_map(|name| self.agents.get(name))
-                .map(|entry| self.told(entry, now))
+                .map(|entry| self.to_wire(entry, now))
                 .collect(),
-            left: names
+            removed: names
                 .iter()
                 .filter(|name| !self.agents.contains_key(*name))
                 .map(ToString::to_string)
@@ -1009,7 +1013,7 @@ impl Neighbor {
             ask: None,
             asked: None,
             relocation_due: None,
-            told: None,
+            last_full_send: None,
             is_cut_reported: false,
         }
     }
@@ -1050,8 +1054,10 @@ impl Neighbor {
             *under_way = SyncState::nothing();
         }
         // Limits the rate of answers to a neighbor that keeps asking.
-        let told = self.told.map_or(now, |told| told + Exchange::FIRST_PAUSE);
-        self.due = told.max(now);
+        let earliest = self
+            .last_full_send
+            .map_or(now, |at| at + Exchange::FIRST_PAUSE);
+        self.due = earliest.max(now);
     }
 
     fn sender(&self) -> Sender {
@@ -1120,7 +1126,7 @@ impl Neighbor {
         }
         let agents = changes.agents.into_iter();
         let joined = agents.filter_map(|agent| self.read(now, agent)).collect();
-        directory.change(&self.sender(), joined, changes.left);
+        directory.change(&self.sender(), joined, changes.removed);
         self.stored = Some(changes.to);
     }
 
@@ -1130,12 +1136,12 @@ impl Neighbor {
         now: Instant,
         mut agent: wire::Agent,
     ) -> Option<(Arc<Entry>, Option<Arc<DfEntry>>)> {
-        let told = agent.df.take();
+        let df = agent.df.take();
         let entry = self.entry(agent)?;
-        let told = told.filter(|_| entry.role == Role::Agent);
-        let df = told.and_then(|told| {
+        let df = df.filter(|_| entry.role == Role::Agent);
+        let df = df.and_then(|df| {
             let of = (self.mts.incarnation, self.principal);
-            DfEntry::read(now, of, (&entry.name, entry.incarnation), told)
+            DfEntry::read(now, of, (&entry.name, entry.incarnation), df)
         });
         Some((entry, df))
     }
@@ -1178,7 +1184,7 @@ impl Neighbor {
 pub enum ExchangeError {
     /// The sender is not a neighbor.
     #[error("the sender of the letter is not a connected gateway")]
-    Stranger,
+    NotConnected,
     /// The letter is too large.
     #[error("the letter has {0} bytes; at most {max} are allowed", max = Exchange::MAX_CONTENT)]
     TooLarge(usize),

@@ -61,8 +61,9 @@ pub(super) struct Changes {
     /// New and changed agents.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) agents: Vec<Agent>,
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub(super) left: Vec<String>,
+    /// The names of the agents that are no longer there.
+    #[serde(rename = "left", default, skip_serializing_if = "Vec::is_empty")]
+    pub(super) removed: Vec<String>,
 }
 
 /// Returns the kind of a letter from its beginning, as this library writes it.
@@ -175,7 +176,7 @@ mod tests {
             lease,
         };
         let text = r#"(df-agent-description :languages (set "a\n"))"#;
-        let told = ExchangeMessage::Full(Full {
+        let letter = ExchangeMessage::Full(Full {
             version: 3,
             first: true,
             last: true,
@@ -184,7 +185,7 @@ mod tests {
                 agent("rover", 8, "", of("", None)),
             ],
         });
-        assert_eq!(String::from_utf8(encode(&told)).unwrap(), LETTER);
+        assert_eq!(String::from_utf8(encode(&letter)).unwrap(), LETTER);
         let ExchangeMessage::Full(read) = decode(LETTER.as_bytes()).unwrap() else {
             panic!("another letter");
         };

@@ -48,7 +48,7 @@ pub fn read_remote(bytes: &[u8]) {
             .expect("an accepted entry is within the limits");
         assert_eq!(agents.named(&entry.name).as_ref(), Some(entry));
     }
-    let lost: Vec<Arc<Entry>> = agents.lost().to_vec();
+    let lost: Vec<Arc<Entry>> = agents.lost_agents().to_vec();
     let Some(gateway) = all.first().map(|entry| match entry.reach {
         crate::Reach::Remote { gateway } => MtsId::new("mts", gateway),
         crate::Reach::Local => panic!("an agent of another host is not local"),
@@ -58,7 +58,7 @@ pub fn read_remote(bytes: &[u8]) {
     let written = remote::write(&gateway, &all, &lost);
     let again = RemoteAgents::open(written).expect("a written file can be read");
     assert_eq!(again.all(), all);
-    assert_eq!(again.lost(), lost);
+    assert_eq!(again.lost_agents(), lost);
     remote::changed(Some(&agents), Some(&again), all.len()).expect("both files can be compared");
 }
 

@@ -237,7 +237,7 @@ pub(super) struct RemoteAgents<F = File> {
     /// The present agents by the hash of their name, and by that of their incarnation.
     names: Box<[Slot]>,
     registrations: Box<[Slot]>,
-    kept: KeptEntries<KEPT>,
+    cached: KeptEntries<KEPT>,
     lost: Vec<Arc<Entry>>,
 }
 
@@ -279,7 +279,7 @@ impl<F: ReadAt> RemoteAgents<F> {
             hasher: RandomState::new(),
             names: Box::default(),
             registrations: Box::default(),
-            kept: KeptEntries::default(),
+            cached: KeptEntries::default(),
             lost: Vec::new(),
         };
         let (mut names, mut registrations, mut lost) = (Vec::new(), Vec::new(), Vec::new());
@@ -313,7 +313,7 @@ impl<F: ReadAt> RemoteAgents<F> {
     }
 
     /// Returns the lost agents.
-    pub(super) fn lost(&self) -> &[Arc<Entry>] {
+    pub(super) fn lost_agents(&self) -> &[Arc<Entry>] {
         &self.lost
     }
 
@@ -423,7 +423,7 @@ impl<F: ReadAt> View for RemoteAgents<F> {
     fn named(&self, name: &str) -> Option<Arc<Entry>> {
         let place = self.slot(name, 0).hash as usize;
         let is_kept = |entry: &Entry| *entry.name == *name;
-        self.kept.get_or(place, is_kept, || {
+        self.cached.get_or(place, is_kept, || {
             self.find(&self.names, name, |record| record.name == name)
         })
     }
@@ -733,7 +733,7 @@ mod tests {
         #[test]
         fn lookups_find_what_was_written(all in agents(), lost in agents()) {
             let read = open(written(&all, &lost));
-            prop_assert_eq!(read.lost(), lost);
+            prop_assert_eq!(read.lost_agents(), lost);
             let mut names = std::collections::BTreeMap::new();
             for entry in &all {
                 names.insert(entry.name.clone(), entry.clone());
@@ -808,8 +808,8 @@ mod tests {
             vec![(list, record); count]
         };
         let all = [list(1, 500), list(2, 10), list(3, 300), list(4, 10)].concat();
-        let kept: Vec<_> = fitting(all.clone(), 110 * MIN_CHARGE).collect();
-        assert_eq!(kept.len(), 45 + 10 + 45 + 10);
+        let fitted: Vec<_> = fitting(all.clone(), 110 * MIN_CHARGE).collect();
+        assert_eq!(fitted.len(), 45 + 10 + 45 + 10);
         assert_eq!(fitting(all, 820 * MIN_CHARGE).count(), 820);
     }
 

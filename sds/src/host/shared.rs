@@ -342,7 +342,10 @@ impl Shared {
         };
         let earlier = lists(before.as_ref());
         let later = Arc::new(lists(after));
-        let lost = later.0.iter().flat_map(|agents| agents.lost().to_vec());
+        let lost = later
+            .0
+            .iter()
+            .flat_map(|agents| agents.lost_agents().to_vec());
         self.table.set_lost(lost.collect::<Vec<_>>());
         self.table.set_beneath(Arc::clone(&later) as Arc<dyn View>);
         if !self.table.is_watched() {
@@ -361,13 +364,13 @@ impl Shared {
     }
 
     fn tell(&self, id: Id, before: &Entries, after: &Entries) {
-        let left = before.keys().filter(|name| !after.contains_key(*name));
-        let left = left.map(|name| (id, name.clone(), None));
+        let removed = before.keys().filter(|name| !after.contains_key(*name));
+        let removed = removed.map(|name| (id, name.clone(), None));
         let changed = after
             .iter()
             .filter(|(name, entry)| before.get(*name) != Some(entry));
         let changed = changed.map(|(name, entry)| (id, name.clone(), Some(Arc::clone(entry))));
-        self.table.update(left.chain(changed));
+        self.table.update(removed.chain(changed));
     }
 
     /// Drops the entries of a process if it is dead. Returns false if it is running.

@@ -62,15 +62,15 @@ impl Alarm {
     /// Waits until the timer expires, if there is one.
     async fn expires(&mut self, due: Instant) -> Option<io::Result<()>> {
         let timer = self.timer.as_ref()?;
-        let left = due.saturating_duration_since(Instant::now());
-        if left.is_zero() {
+        let time_left = due.saturating_duration_since(Instant::now());
+        if time_left.is_zero() {
             return Some(Ok(()));
         }
         let expires = async {
             if self.armed != Some(due) {
                 let value = Itimerspec {
                     it_interval: Timespec::default(),
-                    it_value: Timespec::try_from(left).map_err(io::Error::other)?,
+                    it_value: Timespec::try_from(time_left).map_err(io::Error::other)?,
                 };
                 timerfd_settime(timer, TimerfdTimerFlags::empty(), &value)?;
                 self.armed = Some(due);

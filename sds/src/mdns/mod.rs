@@ -272,7 +272,7 @@ impl Directory for MdnsDirectory {
     /// Applies the update atomically: coalitions in it change together.
     fn update(&self, leaving: &[(Arc<str>, Incarnation)], joining: Vec<Registration>) -> Updated {
         let mut own = self.shared.own.lock();
-        let left = leaving
+        let removals = leaving
             .iter()
             .map(|(name, incarnation)| self.shared.deregister(&mut own, name, *incarnation))
             .collect();
@@ -282,7 +282,7 @@ impl Directory for MdnsDirectory {
         });
         Updated {
             joined: joining.collect(),
-            left,
+            removed: removals,
         }
     }
 }
@@ -350,8 +350,8 @@ impl OwnAgents {
     fn announced(&self) -> beacon::BeaconContent {
         let mut announced = beacon::BeaconContent::default();
         for one in self.agents.values() {
-            if let Some((_, told)) = one.told {
-                announced.all.add(told);
+            if let Some((_, digest)) = one.last_registration {
+                announced.all.add(digest);
             }
             if matches!(one.entry.role, Role::Coalition(_)) {
                 announced.coalitions.add(one.digest);
@@ -375,7 +375,7 @@ struct Announcement {
     due: Option<Instant>,
     digest: Digest,
     /// Time and digest of the last registration with the library.
-    told: Option<(Instant, Digest)>,
+    last_registration: Option<(Instant, Digest)>,
 }
 
 impl Announcement {
@@ -457,7 +457,7 @@ impl Shared {
             // An announced record is changed only after it has settled.
             Some(Announcement {
                 entry: before,
-                told: Some((when, _)),
+                last_registration: Some((when, _)),
                 ..
             }) => {
                 let relocated = moves(before, entry);
@@ -479,7 +479,7 @@ impl Shared {
             digest: Digest::of(&record::encode(entry)),
             host: before.map_or_else(Incarnation::random, |announced| announced.host),
             due: rested.max(turn),
-            told: before.and_then(|announced| announced.told),
+            last_registration: before.and_then(|announced| announced.last_registration),
             fullname,
             attempt,
         };
@@ -487,7 +487,7 @@ impl Shared {
             self.postponed.notify_one();
         } else {
             self.register_with_daemon(&announced)?;
-            announced.told = Some((now, announced.digest));
+            announced.last_registration = Some((now, announced.digest));
         }
         own.agents.insert(entry.name.clone(), announced);
         self.coalition_changed(entry);
@@ -533,7 +533,7 @@ impl Shared {
         for announced in own.agents.values_mut() {
             if announced.due.is_some_and(|due| due <= now) {
                 announced.due = None;
-                announced.told = Some((now, announced.digest));
+                announced.last_registration = Some((now, announced.digest));
                 if let Err(error) = self.register_with_daemon(announced) {
                     let name = &announced.entry.name;
                     self.failed(format!("cannot announce {name:?}: {error}"));
@@ -550,7 +550,7 @@ impl Shared {
         };
         let now = Instant::now();
         own.resting.retain(|_, until| *until > now);
-        if announced.told.is_some() {
+        if announced.last_registration.is_some() {
             self.ask(|daemon| daemon.unregister(&announced.fullname))?;
             own.resting
                 .insert(Arc::clone(&announced.fullname), now + REST);
@@ -656,10 +656,12 @@ impl Shared {
         own.while_stopped = None;
         let now = Instant::now();
         let agents = own.agents.values_mut();
-        let mut before: Vec<_> = agents.filter(|one| one.told.is_some()).collect();
+        let mut before: Vec<_> = agents
+            .filter(|one| one.last_registration.is_some())
+            .collect();
         // Another flood may stop the library before all records are registered; the next start
         // begins with the rest.
-        before.sort_by_key(|one| one.told.map(|(when, _)| when));
+        before.sort_by_key(|one| one.last_registration.map(|(when, _)| when));
         for announced in before {
             let turn = own.pace.turn(now, fastrand::f64());
             announced.due = announced.due.max(Some(turn.unwrap_or(now)));

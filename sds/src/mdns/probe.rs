@@ -48,7 +48,7 @@ pub struct Multicast {
     /// in.
     pub heard_itself: bool,
     /// Hosts from which any multicast packet arrived.
-    pub heard: BTreeSet<IpAddr>,
+    pub multicasting: BTreeSet<IpAddr>,
     /// Hosts that answered the query by unicast.
     pub answered: BTreeSet<IpAddr>,
 }
@@ -115,7 +115,7 @@ impl Probe {
             address: interface.ip(),
             error: None,
             heard_itself: false,
-            heard: BTreeSet::new(),
+            multicasting: BTreeSet::new(),
             answered: BTreeSet::new(),
         };
         let mut probe = Self {
@@ -153,8 +153,8 @@ impl Probe {
         receive(&sockets.group, buffer, |packet, from| {
             if own.contains(&from) {
                 found.heard_itself |= packet == question;
-            } else if found.heard.len() < MAX_OTHERS {
-                found.heard.insert(from);
+            } else if found.multicasting.len() < MAX_OTHERS {
+                found.multicasting.insert(from);
             }
         });
         receive(&sockets.direct, buffer, |packet, from| {

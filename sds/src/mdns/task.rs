@@ -112,9 +112,9 @@ async fn listen(
             },
             answer = next(metrics.as_ref()) => {
                 metrics = None;
-                if let Some(kept) = answer.as_ref().and_then(restart::is_too_much) {
+                if let Some(cached) = answer.as_ref().and_then(restart::is_too_much) {
                     return format!(
-                        "the mDNS library cached {kept}, because a host floods the network; new \
+                        "the mDNS library cached {cached}, because a host floods the network; new \
                          registrations are announced with a delay; find the host that sends so \
                          many packets to UDP port {}",
                         shared.config.port
@@ -252,7 +252,7 @@ fn give_way(shared: &Shared, fullname: &str, theirs: &Entry) {
     let original = fullname.to_lowercase();
     let is_announced = |own: &OwnAgents| {
         let mut all = own.agents.values();
-        all.any(|one| *one.fullname == *original && one.told.is_some())
+        all.any(|one| *one.fullname == *original && one.last_registration.is_some())
     };
     if is_announced(&shared.own.lock()) {
         renamed(shared, &original);

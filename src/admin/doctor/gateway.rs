@@ -63,10 +63,13 @@ pub(super) fn examine(
 
 /// Compares the configuration of the gateway with this one.
 fn configuration(config: &Config, report: &RouteReport) -> Check {
-    let here = config.values();
-    let keys: BTreeSet<&String> = here.keys().chain(report.configuration.keys()).collect();
+    let own_values = config.values();
+    let keys: BTreeSet<&String> = own_values
+        .keys()
+        .chain(report.configuration.keys())
+        .collect();
     let differing = keys.into_iter().filter_map(|key| {
-        let (own, its) = (here.get(key), report.configuration.get(key));
+        let (own, its) = (own_values.get(key), report.configuration.get(key));
         let shown = |value: Option<&String>| value.map_or("not set", String::as_str).to_owned();
         (own != its).then(|| format!("{key} = {} (here: {})", shown(its), shown(own)))
     });

@@ -63,7 +63,7 @@ fn multicast(found: &Multicast) -> Check {
             problem(Severity::Bad, NOT_EVEN_OWN, FIREWALL)
         };
     }
-    match (found.heard.len(), found.answered.len()) {
+    match (found.multicasting.len(), found.answered.len()) {
         (0, 0) if !found.heard_itself => problem(Severity::Bad, NOT_EVEN_OWN, FIREWALL),
         (0, 0) => problem(
             Severity::Warning,
@@ -92,7 +92,7 @@ fn multicast(found: &Multicast) -> Check {
             &format!(
                 "incoming multicast works, outgoing may not: packets of {} arrived, but no host \
                  answered (a host without agents has nothing to answer)",
-                hosts(found.heard.iter())
+                hosts(found.multicasting.iter())
             ),
             &format!(
                 "allow outgoing UDP port 5353, and unicast answers to it, in the firewall of this \
@@ -103,7 +103,7 @@ fn multicast(found: &Multicast) -> Check {
             MULTICAST,
             format!(
                 "{at}: multicast works in both directions, with {}",
-                hosts(found.heard.iter().chain(&found.answered))
+                hosts(found.multicasting.iter().chain(&found.answered))
             ),
         ),
     }

@@ -65,7 +65,7 @@ fn keys(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
     }
     let mut ending = |name: &str, certificate: &Certificate, whose: Whose| {
         let holding = Holding::at(now, certificate);
-        let (Some(problem), Some(advice)) = (holding.told(), holding.advice(now, whose)) else {
+        let (Some(problem), Some(advice)) = (holding.problem(), holding.advice(now, whose)) else {
             return;
         };
         let severity = match holding {
@@ -154,23 +154,23 @@ mod tests {
         other.init("crex-mts", &[], 100 * DAY).unwrap();
         keys.trust(&std::fs::read(other.own_file()).unwrap())
             .unwrap();
-        let made = SystemTime::now();
+        let created_at = SystemTime::now();
         let at = |now| match severities_at(now, &config).as_slice() {
             [(severity, found)] => (*severity, found.clone()),
             found => panic!("{found:?}"),
         };
-        assert_eq!(at(made + 69 * DAY).0, Severity::Fine);
+        assert_eq!(at(created_at + 69 * DAY).0, Severity::Fine);
         for days in [71, 99] {
-            let (severity, found) = at(made + days * DAY);
+            let (severity, found) = at(created_at + days * DAY);
             assert_eq!(severity, Severity::Warning, "after {days} days");
             assert!(found.contains("crex-mts expires within 30 days"), "{found}");
         }
-        let (severity, found) = at(made + 101 * DAY);
+        let (severity, found) = at(created_at + 101 * DAY);
         assert_eq!(severity, Severity::Bad);
         assert!(found.contains("crex-mts has expired"), "{found}");
         // Keys begin a day before they are made, because clocks differ.
-        assert_eq!(at(made - DAY / 2).0, Severity::Fine);
-        for wrong in [made - 2 * DAY, SystemTime::UNIX_EPOCH] {
+        assert_eq!(at(created_at - DAY / 2).0, Severity::Fine);
+        for wrong in [created_at - 2 * DAY, SystemTime::UNIX_EPOCH] {
             let found = severities_at(wrong, &config);
             assert_eq!(found.len(), 2, "{found:?}");
             for (severity, found) in found {
@@ -181,8 +181,8 @@ mod tests {
             assert_clock_comes_first(wrong, &config);
         }
         // Both certificates.
-        assert_eq!(severities_at(made + 2 * VALID, &config).len(), 2);
-        assert_clock_comes_first(made + 2 * VALID, &config);
+        assert_eq!(severities_at(created_at + 2 * VALID, &config).len(), 2);
+        assert_clock_comes_first(created_at + 2 * VALID, &config);
     }
 
     /// Asserts that the advice about each certificate shows this time, and names the clock before the keys.

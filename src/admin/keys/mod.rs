@@ -108,7 +108,7 @@ impl Holding {
     /// Returns the end of a sentence about the certificate, for example `has expired`; `None` for
     /// [`Holding::Well`].
     #[must_use]
-    pub fn told(self) -> Option<&'static str> {
+    pub fn problem(self) -> Option<&'static str> {
         match self {
             Self::Well => None,
             Self::EndsSoon => Some("expires within 30 days"),
@@ -258,10 +258,10 @@ impl Keys {
         params.not_before = (now - SKEW).into();
         params.not_after = until.into();
         let key = KeyPair::generate().map_err(failed)?;
-        let made = params.self_signed(&key).map_err(failed)?;
-        let certificate = Certificate::from_der(made.der().to_vec())?;
+        let signed = params.self_signed(&key).map_err(failed)?;
+        let certificate = Certificate::from_der(signed.der().to_vec())?;
         write_new(&key_file, key.serialize_pem().as_bytes(), 0o600)?;
-        write_new(&file, made.pem().as_bytes(), 0o644)?;
+        write_new(&file, signed.pem().as_bytes(), 0o644)?;
         Ok(certificate)
     }
 
@@ -563,8 +563,8 @@ fn contents(path: &Path, what: &dyn std::fmt::Display) -> KeysError {
 
 fn make_private(dir: &Path) -> Result<(), KeysError> {
     let mut private = DirBuilder::new();
-    let made = private.recursive(true).mode(0o700).create(dir);
-    made.map_err(|source| io_error(dir, source))
+    let created = private.recursive(true).mode(0o700).create(dir);
+    created.map_err(|source| io_error(dir, source))
 }
 
 fn write_new(file: &Path, bytes: &[u8], mode: u32) -> Result<(), KeysError> {

@@ -113,9 +113,10 @@ impl Watcher {
 
     fn is_connected_to_all(&self) -> bool {
         let entries = self.host.entries();
-        let here = entries.iter().filter(|entry| entry.reach == Reach::Local);
+        let local = entries.iter().filter(|entry| entry.reach == Reach::Local);
         let connected: HashSet<Incarnation> = self.joiner.services().collect();
-        here.map(|entry| entry.mts.incarnation)
+        local
+            .map(|entry| entry.mts.incarnation)
             .all(|mts| connected.contains(&mts))
     }
 

@@ -126,7 +126,7 @@ impl Questions {
         };
         gateway.sent = None;
         let asked = std::mem::take(&mut gateway.asked);
-        let (here, gone): (HashSet<_>, HashSet<_>) = match answer {
+        let (registered, gone): (HashSet<_>, HashSet<_>) = match answer {
             Some(answer) => (
                 answer.here.iter().copied().collect(),
                 answer.gone.iter().copied().collect(),
@@ -135,24 +135,24 @@ impl Questions {
         };
         let mut replies = Vec::new();
         self.open.retain(|(agent, _), open| {
-            let mut told = Answer::default();
+            let mut settled = Answer::default();
             open.registrations.retain(|Asked { id, mts }| {
                 if *mts != from || !asked.contains(id) {
                     return true;
                 }
                 match answer {
-                    Some(_) if here.contains(id) => told.here.push(*id),
-                    Some(_) if gone.contains(id) => told.gone.push(*id),
+                    Some(_) if registered.contains(id) => settled.here.push(*id),
+                    Some(_) if gone.contains(id) => settled.gone.push(*id),
                     Some(_) => return true,
-                    None => told.unsupported.push(*id),
+                    None => settled.unsupported.push(*id),
                 }
                 false
             });
-            if told != Answer::default() {
+            if settled != Answer::default() {
                 replies.push(Reply {
                     agent: *agent,
                     question: open.question.clone(),
-                    answer: told,
+                    answer: settled,
                 });
             }
             !open.registrations.is_empty()
@@ -281,12 +281,12 @@ impl GatewayAgent {
         if asked.iter().any(|asked| !is_here(asked.id)) {
             host.refresh();
         }
-        let (here, gone) = asked
+        let (registered, gone) = asked
             .iter()
             .map(|asked| asked.id)
             .partition(|id| is_here(*id));
         Answer {
-            here,
+            here: registered,
             gone,
             ..Answer::default()
         }
@@ -410,10 +410,10 @@ pub(crate) fn play(bytes: &[u8]) {
             }
         };
         for Reply { answer, .. } in replies {
-            let mut told = answer.here.iter().chain(&answer.gone);
-            assert!(told.all(|id| asked_at.contains(&(*id, from))));
-            let mut told = answer.unsupported.iter();
-            assert!(told.all(|id| asked_at.contains(&(*id, from))));
+            let mut settled = answer.here.iter().chain(&answer.gone);
+            assert!(settled.all(|id| asked_at.contains(&(*id, from))));
+            let mut settled = answer.unsupported.iter();
+            assert!(settled.all(|id| asked_at.contains(&(*id, from))));
         }
         let mut letters = 0;
         while let Some((gateway, ask)) = questions.poll_letter(now) {
@@ -468,7 +468,7 @@ mod tests {
         assert_eq!(rates.peers.len(), 1, "the others are forgotten");
     }
 
-    fn here(registrations: &[u64]) -> Answer {
+    fn registered(registrations: &[u64]) -> Answer {
         Answer {
             here: registrations.iter().copied().map(id).collect(),
             ..Answer::default()
@@ -491,20 +491,20 @@ mod tests {
         let other = questions.poll_letter(at(2));
         assert_eq!(other, Some((id(71), vec![asked(12, 71)])));
         assert_eq!(questions.poll_letter(at(2)), None, "waits for the answer");
-        let replies = questions.handle_answer(at(9), id(70), Some(&here(&[10])));
+        let replies = questions.handle_answer(at(9), id(70), Some(&registered(&[10])));
         assert_eq!(replies.len(), 1);
         assert_eq!(
             (replies[0].agent, &replies[0].answer),
-            (id(1), &here(&[10]))
+            (id(1), &registered(&[10]))
         );
         let next = questions.poll_letter(at(9));
         assert_eq!(next, Some((id(70), vec![asked(11, 70)])));
-        let replies = questions.handle_answer(at(10), id(70), Some(&here(&[11])));
+        let replies = questions.handle_answer(at(10), id(70), Some(&registered(&[11])));
         let mut agents: Vec<_> = replies.iter().map(|reply| reply.agent).collect();
         agents.sort();
         assert_eq!(agents, [id(1), id(2)]);
         // The question about the other gateway is still open.
-        let replies = questions.handle_answer(at(11), id(71), Some(&here(&[12])));
+        let replies = questions.handle_answer(at(11), id(71), Some(&registered(&[12])));
         assert_eq!(replies[0].question.conversation_id(), Some("b"));
         assert!(questions.open.is_empty());
     }

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::ErrorChain;
-use fipa_platform::{KeptDescription, KeptSubscription, Platform};
+use fipa_platform::{Platform, StoredDescription, StoredSubscription};
 use fipa_sds::{ContactDirectory, Directory, Entry, Watch};
 use fipa_transport::{Incarnation, Location, Principal, Signature, log_limit};
 use parking_lot::Mutex;
@@ -58,10 +58,10 @@ struct Head {
 #[serde(rename_all = "snake_case")]
 enum Item {
     /// A description in the agent management system.
-    Agent(KeptDescription),
+    Agent(StoredDescription),
     /// A description in the directory facilitator.
-    Description(KeptDescription),
-    Subscription(KeptSubscription),
+    Description(StoredDescription),
+    Subscription(StoredSubscription),
     Contact(KeptContact),
 }
 
@@ -83,8 +83,10 @@ impl Item {
     /// contacts come last because letters make them again.
     fn owner(&self) -> Owner {
         match self {
-            Self::Agent(kept) | Self::Description(kept) => kept.platform.into(),
-            Self::Subscription(kept) => kept.platform.into(),
+            Self::Agent(description) | Self::Description(description) => {
+                description.platform.into()
+            }
+            Self::Subscription(subscription) => subscription.platform.into(),
             Self::Contact(_) => Owner::Contacts,
         }
     }
@@ -92,7 +94,7 @@ impl Item {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Owner {
-    Here,
+    ThisHost,
     Platform(Platform),
     Contacts,
 }
@@ -100,7 +102,7 @@ enum Owner {
 impl From<Platform> for Owner {
     fn from(platform: Platform) -> Self {
         match platform {
-            Platform::Host => Self::Here,
+            Platform::Host => Self::ThisHost,
             other => Self::Platform(other),
         }
     }
@@ -134,18 +136,18 @@ fn lines(items: &[Item], room: usize) -> Vec<String> {
             waiting.entry(item.owner()).or_default().push_back(line);
         }
     }
-    let (mut lines, mut left) = (Vec::new(), room);
+    let (mut lines, mut bytes_left) = (Vec::new(), room);
     let mut take = |line: String| {
-        let fits = line.len() < left;
+        let fits = line.len() < bytes_left;
         if fits {
-            left -= line.len() + 1;
+            bytes_left -= line.len() + 1;
             lines.push(line);
         }
         fits
     };
-    let here = waiting.remove(&Owner::Here);
+    let of_this_host = waiting.remove(&Owner::ThisHost);
     let contacts = waiting.remove(&Owner::Contacts);
-    for line in here.into_iter().flatten() {
+    for line in of_this_host.into_iter().flatten() {
         take(line);
     }
     while !waiting.is_empty() {
@@ -202,9 +204,9 @@ fn decode(bytes: &[u8]) -> Result<(Head, Vec<Item>), StateError> {
 /// The items of a predecessor, sorted by what they are for.
 #[derive(Debug, Default)]
 pub(super) struct Predecessor {
-    pub(super) agents: Vec<KeptDescription>,
-    pub(super) descriptions: Vec<KeptDescription>,
-    pub(super) subscriptions: Vec<KeptSubscription>,
+    pub(super) agents: Vec<StoredDescription>,
+    pub(super) descriptions: Vec<StoredDescription>,
+    pub(super) subscriptions: Vec<StoredSubscription>,
     contacts: Vec<KeptContact>,
     /// Time since the file was written.
     pub(super) elapsed: Duration,
@@ -220,10 +222,10 @@ impl Predecessor {
         };
         for item in items {
             match item {
-                Item::Agent(kept) => all.agents.push(kept),
-                Item::Description(kept) => all.descriptions.push(kept),
-                Item::Subscription(kept) => all.subscriptions.push(kept),
-                Item::Contact(kept) => all.contacts.push(kept),
+                Item::Agent(agent) => all.agents.push(agent),
+                Item::Description(description) => all.descriptions.push(description),
+                Item::Subscription(subscription) => all.subscriptions.push(subscription),
+                Item::Contact(contact) => all.contacts.push(contact),
             }
         }
         all
@@ -288,10 +290,10 @@ impl Trust {
 
 /// The state that the agents of this gateway keep at present.
 #[derive(Debug, Clone, Default)]
-struct Kept {
-    agents: Arc<[KeptDescription]>,
-    descriptions: Arc<[KeptDescription]>,
-    subscriptions: Arc<[KeptSubscription]>,
+struct CurrentState {
+    agents: Arc<[StoredDescription]>,
+    descriptions: Arc<[StoredDescription]>,
+    subscriptions: Arc<[StoredSubscription]>,
     /// The time of each of the two parts: their leases are relative to it.
     agents_at: Option<Instant>,
     facilitator_at: Option<Instant>,
@@ -305,7 +307,7 @@ pub(super) struct StateFile {
     view: Arc<dyn Directory>,
     contacts: Arc<ContactDirectory>,
     neighbors: Arc<Neighbors>,
-    kept: Mutex<Kept>,
+    current: Mutex<CurrentState>,
     changed: Notify,
     /// The lines in the file; `None` after the end of the gateway.
     written: Mutex<Option<Vec<String>>>,
@@ -327,7 +329,7 @@ impl StateFile {
             view,
             contacts,
             neighbors,
-            kept: Mutex::default(),
+            current: Mutex::default(),
             changed: Notify::new(),
             written: Mutex::new(Some(Vec::new())),
         }
@@ -359,7 +361,7 @@ impl StateFile {
         let predecessor = Predecessor::new(&head, items, now);
         // The first version of this gateway must not have less.
         let at = Instant::now().checked_sub(predecessor.elapsed);
-        *self.kept.lock() = Kept {
+        *self.current.lock() = CurrentState {
             agents: predecessor.agents.clone().into(),
             descriptions: predecessor.descriptions.clone().into(),
             subscriptions: predecessor.subscriptions.clone().into(),
@@ -371,14 +373,16 @@ impl StateFile {
             let now = Instant::now();
             let further = contact.further.iter().filter_map(|it| it.parse().ok());
             let further: Vec<Location> = further.take(Entry::MAX_LOCATIONS - 1).collect();
-            let heard = match further.is_empty() {
-                true => self.contacts.heard(now, &contact.name, agent, location),
+            let recorded = match further.is_empty() {
+                true => self
+                    .contacts
+                    .record_sender(now, &contact.name, agent, location),
                 false => {
                     let all = std::iter::once(location).chain(further).collect();
                     self.contacts.introduce(now, &contact.name, all, false)
                 }
             };
-            if let Err(error) = heard {
+            if let Err(error) = recorded {
                 tracing::debug!(error = %ErrorChain(&error), "ignored a contact of the last gateway");
             }
         }
@@ -391,10 +395,10 @@ impl StateFile {
     }
 
     /// Sets what the agent management system keeps.
-    pub(super) fn set_agents(&self, now: Instant, agents: Vec<KeptDescription>) {
-        let mut kept = self.kept.lock();
-        (kept.agents, kept.agents_at) = (agents.into(), Some(now));
-        self.pin(&kept);
+    pub(super) fn set_agents(&self, now: Instant, agents: Vec<StoredDescription>) {
+        let mut current = self.current.lock();
+        (current.agents, current.agents_at) = (agents.into(), Some(now));
+        self.pin(&current);
         self.changed.notify_one();
     }
 
@@ -402,20 +406,20 @@ impl StateFile {
     pub(super) fn set_services(
         &self,
         now: Instant,
-        (descriptions, subscriptions): (Vec<KeptDescription>, Vec<KeptSubscription>),
+        (descriptions, subscriptions): (Vec<StoredDescription>, Vec<StoredSubscription>),
     ) {
-        let mut kept = self.kept.lock();
-        (kept.descriptions, kept.subscriptions) = (descriptions.into(), subscriptions.into());
-        kept.facilitator_at = Some(now);
-        self.pin(&kept);
+        let mut current = self.current.lock();
+        (current.descriptions, current.subscriptions) = (descriptions.into(), subscriptions.into());
+        current.facilitator_at = Some(now);
+        self.pin(&current);
         self.changed.notify_one();
     }
 
     /// Keeps the contacts that have left a description or a subscription here.
-    fn pin(&self, kept: &Kept) {
-        let descriptions = kept.agents.iter().chain(&*kept.descriptions);
+    fn pin(&self, current: &CurrentState) {
+        let descriptions = current.agents.iter().chain(&*current.descriptions);
         let names = descriptions.map(|it| &it.name);
-        let names = names.chain(kept.subscriptions.iter().map(|it| &it.name));
+        let names = names.chain(current.subscriptions.iter().map(|it| &it.name));
         self.contacts.pin(names.cloned().collect());
     }
 
@@ -488,23 +492,29 @@ impl StateFile {
 
     /// Returns the items, with the leases from `now` on.
     fn items(&self, now: Instant) -> Vec<Item> {
-        let kept = self.kept.lock().clone();
-        let aged = |kept: &KeptDescription, at: Option<Instant>| {
+        let current = self.current.lock().clone();
+        let aged = |stored: &StoredDescription, at: Option<Instant>| {
             let passed = at.map(|at| now.saturating_duration_since(at).as_millis());
             let passed = u64::try_from(passed.unwrap_or(0)).unwrap_or(u64::MAX);
-            let mut kept = kept.clone();
-            kept.left = kept.left.map(|left| left.saturating_sub(passed));
-            kept
+            let mut stored = stored.clone();
+            stored.lease_left = stored
+                .lease_left
+                .map(|lease_left| lease_left.saturating_sub(passed));
+            stored
         };
-        let agents = kept.agents.iter();
-        let agents = agents.map(|it| Item::Agent(aged(it, kept.agents_at)));
-        let services = kept.descriptions.iter();
-        let services = services.map(|it| Item::Description(aged(it, kept.facilitator_at)));
-        let subscriptions = kept.subscriptions.iter().cloned().map(Item::Subscription);
+        let agents = current.agents.iter();
+        let agents = agents.map(|it| Item::Agent(aged(it, current.agents_at)));
+        let services = current.descriptions.iter();
+        let services = services.map(|it| Item::Description(aged(it, current.facilitator_at)));
+        let subscriptions = current
+            .subscriptions
+            .iter()
+            .cloned()
+            .map(Item::Subscription);
         let mut items: Vec<Item> = agents.chain(subscriptions).chain(services).collect();
         // A subscriber that a directory shows is unknown to a successor until that directory arrives.
         let mut known: BTreeMap<Arc<str>, Arc<Entry>> = BTreeMap::new();
-        for it in &*kept.subscriptions {
+        for it in &*current.subscriptions {
             let entry = self
                 .view
                 .lookup(&it.name)
@@ -580,23 +590,23 @@ pub(crate) fn play(bytes: &[u8]) {
     for (contact, location) in all.contacts(&Trust::default()) {
         let contacts = ContactDirectory::new();
         let agent = Incarnation::from_u64(contact.agent);
-        drop(contacts.heard(Instant::now(), &contact.name, agent, location));
+        drop(contacts.record_sender(Instant::now(), &contact.name, agent, location));
     }
     let id = fipa_acl::AgentId::new("df@mts").expect("a name");
     let now = PlatformTime {
         at: Instant::now(),
         wall: std::time::SystemTime::now(),
     };
-    let take_over = |kept: (&[KeptDescription], &[KeptSubscription])| {
+    let take_over = |stored: (&[StoredDescription], &[StoredSubscription])| {
         let mut df = Df::new(id.clone());
-        df.take_over(now, all.elapsed, kept, |platform| {
+        df.take_over(now, all.elapsed, stored, |platform| {
             all.stays(platform, &Trust::default())
         });
         df.keep(now.at)
     };
-    let kept = take_over((&all.descriptions, &all.subscriptions));
-    let items = kept.0.iter().cloned().map(Item::Description);
-    let subscriptions = kept.1.iter().cloned().map(Item::Subscription);
+    let taken_over = take_over((&all.descriptions, &all.subscriptions));
+    let items = taken_over.0.iter().cloned().map(Item::Description);
+    let subscriptions = taken_over.1.iter().cloned().map(Item::Subscription);
     let lines = lines(
         &items.chain(subscriptions).collect::<Vec<_>>(),
         MAX_BYTES / 2,
@@ -607,7 +617,7 @@ pub(crate) fn play(bytes: &[u8]) {
     };
     let (_, again) = decode(&encode(&head, &lines)).expect("a written file is read");
     let again = Predecessor::new(&head, again, head.written);
-    assert_eq!((again.descriptions, again.subscriptions), kept);
+    assert_eq!((again.descriptions, again.subscriptions), taken_over);
     let platform = ApDescription {
         name: "mts".to_owned(),
         services: Vec::new(),

@@ -97,8 +97,8 @@ impl<G: Greeting> Dialing<G> {
         if let Some(candidate) = self.candidate(path) {
             candidate.next = None;
         }
-        let mut left = self.candidates.iter_mut().filter_map(|c| c.next.as_mut());
-        match left.next() {
+        let mut pending = self.candidates.iter_mut().filter_map(|c| c.next.as_mut());
+        match pending.next() {
             // The next path need not wait any longer.
             Some(next) => *next = now.min(*next),
             None => {

@@ -160,7 +160,7 @@ impl<P: Protocol> Endpoint<P> {
     /// Handles a change of the network interfaces: reports the new locations to the sink, and ends
     /// the connections of local addresses that no longer exist.
     fn interfaces_changed(&self) {
-        let (sink, told) = {
+        let (sink, locations) = {
             let mut state = self.state.lock();
             let moved = match state.listening.refresh() {
                 Ok(moved) => moved,
@@ -179,12 +179,12 @@ impl<P: Protocol> Endpoint<P> {
                 });
             }
             self.flush_and_wake(&mut state);
-            let told = moved
+            let locations = moved
                 .relocated
                 .then(|| state.listening.locations(P::KIND, self.incarnation));
-            (state.sink.clone(), told)
+            (state.sink.clone(), locations)
         };
-        match (sink, told) {
+        match (sink, locations) {
             (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
             (_, Some(Err(error))) => {
                 log_limit::warn!(kind = %P::KIND, %error, "cannot refresh the locations; keeping the previous ones");
@@ -359,15 +359,15 @@ impl<P: Protocol> Endpoint<P> {
     fn deliver(&self) {
         let _one_at_a_time = self.delivering.lock();
         loop {
-            let (told, sink) = {
+            let (event, sink) = {
                 let mut state = self.state.lock();
-                let told = state.core.as_mut().and_then(P::poll_event);
-                match (told, state.sink.clone()) {
-                    (Some(told), Some(sink)) => (told, sink),
+                let event = state.core.as_mut().and_then(P::poll_event);
+                match (event, state.sink.clone()) {
+                    (Some(event), Some(sink)) => (event, sink),
                     _ => return,
                 }
             };
-            P::deliver(told, &*sink, &|call| {
+            P::deliver(event, &*sink, &|call| {
                 if let Some(core) = self.state.lock().core.as_mut() {
                     call(core);
                 }

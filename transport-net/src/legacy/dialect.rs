@@ -42,7 +42,7 @@ impl TranslateError {
 
 /// The address at which the agents of this host receive answers.
 #[derive(Clone, Copy)]
-pub(crate) struct Here<'a> {
+pub(crate) struct ReplyAddress<'a> {
     /// The URL.
     pub(crate) url: &'a str,
     /// Whether an agent of this host has a name.
@@ -55,7 +55,7 @@ pub(crate) fn translate(
     letter: &Letter,
     receiver: &str,
     at: &Location,
-    here: Option<Here<'_>>,
+    reply_address: Option<ReplyAddress<'_>>,
 ) -> Result<[Bytes; 2], TranslateError> {
     let signature = at.signature();
     let envelope = letter.parse_envelope()?;
@@ -81,7 +81,7 @@ pub(crate) fn translate(
             if message.sender().is_none() {
                 return Err(TranslateError::NoSender);
             }
-            let message = with_address(message, here);
+            let message = with_address(message, reply_address);
             let message = message.encode(representation, Dialect::Jade)?;
             let is_text = representation != Representation::BitEfficient;
             let length = match at.kind() {
@@ -95,8 +95,8 @@ pub(crate) fn translate(
             let mut envelope = addressed(envelope, to, named, length);
             let names_charset = is_text && !message.is_ascii();
             envelope.base.payload_encoding = names_charset.then(|| "UTF-8".to_owned());
-            if let (Some(from), Some(here)) = (&mut envelope.base.from, here) {
-                add_address(from, here.url);
+            if let (Some(from), Some(reply_address)) = (&mut envelope.base.from, reply_address) {
+                add_address(from, reply_address.url);
             }
             let envelope = envelope.encode(Representation::Xml, Dialect::Jade)?;
             Ok([envelope, message])
@@ -146,28 +146,28 @@ fn addressed(
     envelope
 }
 
-fn add_address(agent: &mut AgentId, here: &str) {
+fn add_address(agent: &mut AgentId, url: &str) {
     if agent.addresses().is_empty()
-        && let Ok(with) = agent.clone().with_address(here)
+        && let Ok(with) = agent.clone().with_address(url)
     {
         *agent = with;
     }
 }
 
 /// Returns the message with an address of its sender, and of the agents of this host in `reply-to`.
-fn with_address(message: Message, here: Option<Here<'_>>) -> Message {
-    let (Some(sender), Some(here)) = (message.sender(), here) else {
+fn with_address(message: Message, reply_address: Option<ReplyAddress<'_>>) -> Message {
+    let (Some(sender), Some(reply_address)) = (message.sender(), reply_address) else {
         return message;
     };
     let lacks = |agent: &AgentId| agent.addresses().is_empty();
-    let is_here = |agent: &AgentId| agent.same_agent(sender) || (here.has)(agent.name());
+    let is_local = |agent: &AgentId| agent.same_agent(sender) || (reply_address.has)(agent.name());
     let reply_to: Vec<AgentId> = message
         .reply_to()
         .iter()
         .map(|agent| {
             let mut agent = agent.clone();
-            if lacks(&agent) && is_here(&agent) {
-                add_address(&mut agent, here.url);
+            if lacks(&agent) && is_local(&agent) {
+                add_address(&mut agent, reply_address.url);
             }
             agent
         })
@@ -176,7 +176,7 @@ fn with_address(message: Message, here: Option<Here<'_>>) -> Message {
         return message;
     }
     let mut sender = sender.clone();
-    add_address(&mut sender, here.url);
+    add_address(&mut sender, reply_address.url);
     let mut builder = Message::builder(message.performative().clone())
         .sender(sender)
         .receivers(message.receivers().iter().cloned());
@@ -228,9 +228,9 @@ mod tests {
     }
 
     /// This host, which has the agents `rover` and `crane`.
-    fn own(url: &str) -> Here<'_> {
+    fn own(url: &str) -> ReplyAddress<'_> {
         let has = &|name: &str| ["rover", "crane"].contains(&name);
-        Here { url, has }
+        ReplyAddress { url, has }
     }
 
     fn date() -> Time {
@@ -308,9 +308,9 @@ mod tests {
         let over = [Kind::Tcp, Kind::Http, Kind::Https];
         let contents = ["hello", "grüß dich"];
         for (kind, content) in over.iter().flat_map(|kind| contents.map(|it| (*kind, it))) {
-            let here = Some(own("tcp://10.0.0.1:7788"));
+            let own_address = Some(own("tcp://10.0.0.1:7788"));
             let jade = at(kind, Signature::JadeProxy);
-            let [envelope, bytes] = translate(&letter(content), "arm", &jade, here).unwrap();
+            let [envelope, bytes] = translate(&letter(content), "arm", &jade, own_address).unwrap();
             assert!(envelope.starts_with(b"<?xml"));
             let (read, len) = Envelope::decode(&envelope).unwrap();
             assert_eq!(len, envelope.len());
@@ -347,12 +347,12 @@ mod tests {
             (Signature::JadeBitEfficient, AclRepresentation::BitEfficient),
         ] {
             for content in ["hello", "(a \"b\")", "grüß dich"] {
-                let here = "http://10.0.0.1:7778/acc";
+                let own_address = "http://10.0.0.1:7778/acc";
                 let [envelope, bytes] = translate(
                     &letter(content),
                     "arm",
                     &at(Kind::Http, signature),
-                    Some(own(here)),
+                    Some(own(own_address)),
                 )
                 .unwrap();
                 assert!(envelope.starts_with(b"<?xml"));
@@ -361,7 +361,7 @@ mod tests {
                 assert_eq!(effective.acl_representation, Some(representation.clone()));
                 let said = Message::decode(&bytes.clone().into()).unwrap();
                 assert_eq!(said.content().unwrap(), content);
-                assert_eq!(said.sender().unwrap().addresses(), [here]);
+                assert_eq!(said.sender().unwrap().addresses(), [own_address]);
                 let is_text = signature == Signature::JadeXml;
                 let named = effective.payload_encoding.is_some();
                 assert_eq!(named, is_text && !content.is_ascii());

@@ -67,15 +67,15 @@ async fn connect(
     address: SocketAddr,
     refused: Refused,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let told = |error: ConnectionError| {
+    let recorded = |error: ConnectionError| {
         let lost = lost(&error);
         if let ConnectionError::TransportError(_) | ConnectionError::ConnectionClosed(_) = error {
             refused.dials.add(&refused.to, &lost.to_string());
         }
         lost
     };
-    let connection = sockets.dial(address)?.await.map_err(told)?;
-    let (send, receive) = connection.open_bi().await.map_err(told)?;
+    let connection = sockets.dial(address)?.await.map_err(recorded)?;
+    let (send, receive) = connection.open_bi().await.map_err(recorded)?;
     Ok((connection, send, receive))
 }
 

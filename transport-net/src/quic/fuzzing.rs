@@ -292,7 +292,7 @@ impl Sink for Recorder {
         state.is_introduced = true;
     }
 
-    fn parted(&self, _: &Introduction) {
+    fn disconnected(&self, _: &Introduction) {
         let mut state = self.state.lock();
         assert!(state.is_introduced && !state.has_parted);
         state.has_parted = true;
@@ -485,8 +485,8 @@ impl QuicStreams {
         let is_open = attempt.0 < self.dispatched
             && !self.sink.state.lock().concluded.contains_key(&attempt)
             && self.abandoned.insert(attempt);
-        let told = self.link.abandon(attempt);
-        assert!(is_open || told.is_none_or(|told| told == Abandoned::Unconfirmed));
+        let abandoned = self.link.abandon(attempt);
+        assert!(is_open || abandoned.is_none_or(|it| it == Abandoned::Unconfirmed));
         self.poll();
     }
 

@@ -140,7 +140,7 @@ impl Transport for QuicTransport {
         self.endpoint.abandon(attempt, to)
     }
 
-    fn left(&self, location: &Location) {
+    fn location_vacated(&self, location: &Location) {
         self.endpoint.service_left(location);
     }
 

@@ -210,7 +210,7 @@ struct State {
 struct Begun {
     lane: Lane,
     /// Number of missing bytes.
-    left: u64,
+    remaining: u64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -241,13 +241,14 @@ impl Outgoing {
             Some(begun) => begun,
             None => {
                 // Frames of this side begin with their whole header in one piece.
-                let (is_parcel, left) = frame::begun(bytes).ok_or(io::ErrorKind::InvalidInput)?;
+                let (is_parcel, remaining) =
+                    frame::begun(bytes).ok_or(io::ErrorKind::InvalidInput)?;
                 let lane = if is_parcel {
                     Lane::Letter
                 } else {
                     Lane::Control
                 };
-                Begun { lane, left }
+                Begun { lane, remaining }
             }
         };
         state.blocked = begun.lane;
@@ -259,7 +260,8 @@ impl Outgoing {
                 Poll::Pending => return Err(io::ErrorKind::WouldBlock.into()),
             }
         }
-        let most = usize::try_from(begun.left).map_or(bytes.len(), |left| left.min(bytes.len()));
+        let most = usize::try_from(begun.remaining)
+            .map_or(bytes.len(), |remaining| remaining.min(bytes.len()));
         let stream = state
             .stream(begun.lane)
             .ok_or(io::ErrorKind::NotConnected)?;
@@ -269,9 +271,9 @@ impl Outgoing {
             // Another frame may precede this one, if it has not begun.
             Poll::Pending => return Err(io::ErrorKind::WouldBlock.into()),
         };
-        let left = begun.left.saturating_sub(taken as u64);
-        state.begun = (left > 0).then_some(Begun { left, ..begun });
-        if left == 0
+        let remaining = begun.remaining.saturating_sub(taken as u64);
+        state.begun = (remaining > 0).then_some(Begun { remaining, ..begun });
+        if remaining == 0
             && begun.lane == Lane::Letter
             && let Some(mut letter) = state.letter.take()
         {

@@ -31,8 +31,8 @@ pub(crate) struct TlsFailure(String);
 
 impl TlsFailure {
     /// Creates the error of a wire with this text.
-    pub(crate) fn io(told: String) -> io::Error {
-        io::Error::new(io::ErrorKind::InvalidData, Self(told))
+    pub(crate) fn io(text: String) -> io::Error {
+        io::Error::new(io::ErrorKind::InvalidData, Self(text))
     }
 
     /// Returns the failure of TLS in an error of a wire.
@@ -180,7 +180,7 @@ fn word(word: &str) -> String {
 }
 
 /// Returns the text for an error of TLS, with the remedy.
-pub(crate) fn told(error: &Error) -> String {
+pub(crate) fn text_with_remedy(error: &Error) -> String {
     match error {
         Error::AlertReceived(alert) => alert_of_peer(*alert, &of_alert(*alert, Finder::Peer)),
         _ => format!("{} ({})", in_words(&error.to_string()), of_error(error)),

@@ -196,7 +196,7 @@ impl Certificate {
     }
 
     /// Returns the time from `now` until the certificate expires.
-    pub(crate) fn left(&self, now: SystemTime) -> Duration {
+    pub(crate) fn time_left(&self, now: SystemTime) -> Duration {
         left_until(self.until, now)
     }
 

@@ -279,9 +279,9 @@ impl Security {
     }
 
     /// Returns the time until what a peer has presented must be judged again; zero if it has expired.
-    fn left(&self, evidence: &Evidence, now: SystemTime) -> Duration {
+    fn time_left(&self, evidence: &Evidence, now: SystemTime) -> Duration {
         match evidence {
-            Evidence::Listed(certificate) => certificate.left(now),
+            Evidence::Listed(certificate) => certificate.time_left(now),
             #[cfg(feature = "http")]
             Evidence::Chain(chain) => match self.still_trusts(evidence) {
                 true => chain.next_end(now),

@@ -57,11 +57,11 @@ struct Judged {
 impl Trust {
     /// Creates the trust that a handshake has established with credentials of this revision.
     pub(super) fn new(security: &Security, revision: u64, evidence: Evidence) -> Self {
-        let left = security.left(&evidence, SystemTime::now());
+        let time_left = security.time_left(&evidence, SystemTime::now());
         Self {
             judged: Mutex::new(Judged {
                 revision,
-                expiry: Expiry::new(Instant::now(), left),
+                expiry: Expiry::new(Instant::now(), time_left),
                 end: None,
             }),
             security: security.clone(),
@@ -112,10 +112,10 @@ impl Trust {
         let revision = self.security.revision();
         let is_trusted = revision == judged.revision || self.security.still_trusts(&self.evidence);
         judged.revision = revision;
-        let left = || self.security.left(&self.evidence, SystemTime::now());
+        let time_left = || self.security.time_left(&self.evidence, SystemTime::now());
         let end = match is_trusted {
             false => ConnectionEnd::Distrusted,
-            true if judged.expiry.has_passed(now, left) => {
+            true if judged.expiry.has_passed(now, time_left) => {
                 ConnectionEnd::Expired(advice::expired())
             }
             true => return Ok(judged.expiry.next_check(now)),
@@ -143,8 +143,9 @@ impl Chain {
     /// Returns the time from `now` until the next of its certificates ends.
     pub(super) fn next_end(&self, now: SystemTime) -> Duration {
         let ends = self.ends.iter();
-        let left = ends.map(|end| left_until(*end, now));
-        left.filter(|left| !left.is_zero())
+        let time_left = ends.map(|end| left_until(*end, now));
+        time_left
+            .filter(|time_left| !time_left.is_zero())
             .min()
             .unwrap_or_default()
     }
@@ -164,10 +165,10 @@ impl Expiry {
     const LONGEST_SLEEP: Duration = Duration::from_secs(86_400);
 
     /// The expiry of a certificate that is valid for this time.
-    fn new(now: Instant, left: Duration) -> Self {
+    fn new(now: Instant, time_left: Duration) -> Self {
         const CENTURY: Duration = Duration::from_secs(100 * 365 * 86_400);
         Self {
-            ends: now + left.min(CENTURY),
+            ends: now + time_left.min(CENTURY),
         }
     }
 
@@ -178,13 +179,13 @@ impl Expiry {
 
     /// Whether the certificate has expired by both clocks. `left` is the remaining time by the
     /// calendar.
-    fn has_passed(&mut self, now: Instant, left: impl FnOnce() -> Duration) -> bool {
+    fn has_passed(&mut self, now: Instant, time_left: impl FnOnce() -> Duration) -> bool {
         if now < self.ends {
             return false;
         }
-        let left = left();
-        *self = Self::new(now, left);
-        left.is_zero()
+        let time_left = time_left();
+        *self = Self::new(now, time_left);
+        time_left.is_zero()
     }
 }
 
@@ -217,10 +218,10 @@ mod tests {
             }
             params.not_before = (calendar - DAY).into();
             params.not_after = (calendar + 10 * DAY).into();
-            let made = params.self_signed(&KeyPair::generate().unwrap()).unwrap();
-            let certificate = Certificate::from_der(made.der().to_vec()).unwrap();
+            let signed = params.self_signed(&KeyPair::generate().unwrap()).unwrap();
+            let certificate = Certificate::from_der(signed.der().to_vec()).unwrap();
             let start = Instant::now();
-            let expiry = Expiry::new(start, certificate.left(calendar));
+            let expiry = Expiry::new(start, certificate.time_left(calendar));
             Self {
                 certificate,
                 start,
@@ -237,8 +238,8 @@ mod tests {
         }
 
         fn has_expired(&mut self) -> bool {
-            let left = || self.certificate.left(self.calendar);
-            self.expiry.has_passed(self.now, left)
+            let time_left = || self.certificate.time_left(self.calendar);
+            self.expiry.has_passed(self.now, time_left)
         }
 
         /// Sleeps until each next check. Returns the time on the monotonic clock after which the

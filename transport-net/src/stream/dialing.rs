@@ -100,7 +100,7 @@ where
                 Err(ConnectionEnd::unreachable(to, &what))
             }
         },
-        end = link.leaving() => Err(end),
+        end = link.end_requested() => Err(end),
     }
 }
 

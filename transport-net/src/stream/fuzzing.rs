@@ -235,8 +235,8 @@ impl Framed {
         let is_open = attempt.0 < self.dispatched
             && !self.concluded.contains_key(&attempt)
             && self.abandoned.insert(attempt);
-        let told = self.connection.abandon(attempt, now);
-        assert!(is_open || told.is_none_or(|told| told == Abandoned::Unconfirmed));
+        let abandoned = self.connection.abandon(attempt, now);
+        assert!(is_open || abandoned.is_none_or(|it| it == Abandoned::Unconfirmed));
     }
 
     /// Answers one of the parcels that arrived.

@@ -84,7 +84,7 @@ struct State {
     /// The last location for which the connection was used and confirmed or put in doubt.
     leads_to: Option<Location>,
     /// Time at which the peer announced that it is no longer at the location of this connection.
-    left: Option<Instant>,
+    peer_moved_at: Option<Instant>,
 }
 
 /// The result of a flush.
@@ -106,7 +106,7 @@ impl Link {
                 together: false,
                 ending: None,
                 leads_to: None,
-                left: None,
+                peer_moved_at: None,
             }),
             wake: Notify::new(),
             received: Notify::new(),
@@ -262,8 +262,8 @@ impl Link {
 
     /// Puts the connection in doubt because the peer has announced that it is no longer at this location.
     #[cfg(feature = "ip")]
-    pub(crate) fn left(&self) {
-        self.state.lock().left = Some(Instant::now());
+    pub(crate) fn peer_moved(&self) {
+        self.state.lock().peer_moved_at = Some(Instant::now());
         self.doubt();
         self.received.notify_waiters();
     }
@@ -281,21 +281,21 @@ impl Link {
         &self,
         asked: Instant,
         timeout: Duration,
-        after_left: Duration,
+        after_move: Duration,
     ) -> bool {
         loop {
             let received = self.received.notified();
             tokio::pin!(received);
             received.as_mut().enable();
-            let left = {
+            let moved_at = {
                 let state = self.state.lock();
                 if state.connection.received_since(asked) {
                     return true;
                 }
-                state.left
+                state.peer_moved_at
             };
-            let left = left.map(|left| left.max(asked) + after_left);
-            let due = left.map_or(asked + timeout, |left| left.min(asked + timeout));
+            let due_after_move = moved_at.map(|at| at.max(asked) + after_move);
+            let due = due_after_move.map_or(asked + timeout, |at| at.min(asked + timeout));
             let due = tokio::time::Instant::from_std(due);
             tokio::select! {
                 () = received => {}
@@ -318,7 +318,7 @@ impl Link {
     }
 
     /// Waits until the end is requested.
-    pub(crate) async fn leaving(&self) -> ConnectionEnd {
+    pub(crate) async fn end_requested(&self) -> ConnectionEnd {
         loop {
             if let Some(end) = self.state.lock().ending.clone() {
                 return end;
@@ -942,7 +942,7 @@ impl Drop for LinkTask {
             self.endpoint.config.refused_dials.add(to, &refusal.detail);
         }
         let detour = self.peer.is_none() && self.endpoint.has_detour(&self.link);
-        self.endpoint.left(&self.link, &self.end);
+        self.endpoint.connection_ended(&self.link, &self.end);
         for (attempt, conclusion) in concluded {
             let conclusion = match conclusion {
                 Conclusion::NotSent(error) if detour => Conclusion::NotSent(again(&error)),
@@ -951,7 +951,7 @@ impl Drop for LinkTask {
             self.sink.concluded(attempt, conclusion);
         }
         if let Some(peer) = &self.peer {
-            self.sink.parted(peer);
+            self.sink.disconnected(peer);
         }
         self.link.over.send_replace(true);
     }

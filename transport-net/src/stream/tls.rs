@@ -103,7 +103,7 @@ const ACCEPT_CAUSES: &str = "the peer may have ended or given up; see its log";
 fn handshake_error(error: &io::Error, causes: &str) -> String {
     let inner = error.get_ref().and_then(|it| it.downcast_ref());
     match inner {
-        Some(inner) => format!("TLS handshake failed: {}", advice::told(inner)),
+        Some(inner) => format!("TLS handshake failed: {}", advice::text_with_remedy(inner)),
         None if is_end(error) => format!(
             "the peer closed the connection during the TLS handshake and sent no alert ({error}); {causes}"
         ),
@@ -242,7 +242,7 @@ impl Incoming {
             let processed = session.process_new_packets();
             // In TLS 1.3 a client completes the handshake before the server has accepted its
             // certificate.
-            processed.map_err(|error| TlsFailure::io(advice::told(&error)))?;
+            processed.map_err(|error| TlsFailure::io(advice::text_with_remedy(&error)))?;
         }
     }
 }

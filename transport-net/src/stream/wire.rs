@@ -268,10 +268,10 @@ async fn read(socket: &mut (impl AsyncRead + Unpin), space: &mut Space<'_>) -> i
 
 async fn drain(socket: &mut (impl AsyncRead + Unpin), most: usize) {
     let mut ignored = [0; 4096];
-    let mut left = most;
-    while left > 0 {
+    let mut remaining = most;
+    while remaining > 0 {
         match socket.read(&mut ignored).await {
-            Ok(len @ 1..) => left = left.saturating_sub(len),
+            Ok(len @ 1..) => remaining = remaining.saturating_sub(len),
             _ => return,
         }
     }

@@ -39,8 +39,8 @@ pub(crate) async fn accept(endpoint: Arc<TcpEndpoint>, listener: TcpListener) {
                     return;
                 }
                 serve(&endpoint, turn, stream, from);
-                let (waiting, left) = endpoint.legacy.accept_queue.progress();
-                if pace.pauses(waiting, left) {
+                let (waiting, departures) = endpoint.legacy.accept_queue.progress();
+                if pace.pauses(waiting, departures) {
                     sleep(Pace::PAUSE).await;
                 }
             }
@@ -56,7 +56,7 @@ pub(crate) async fn accept(endpoint: Arc<TcpEndpoint>, listener: TcpListener) {
 #[derive(Debug, Default)]
 struct Pace {
     /// Number of connections that had left the queues at the last pause.
-    left: u64,
+    departures: u64,
     /// Number of pauses since a connection left the queues.
     fruitless: u32,
 }
@@ -70,9 +70,12 @@ impl Pace {
     /// Maximum number of consecutive pauses in which no connection leaves the queues.
     const MAX_PAUSES: u32 = 50;
 
-    fn pauses(&mut self, waiting: usize, left: u64) -> bool {
-        if left != self.left {
-            *self = Self { left, fruitless: 0 };
+    fn pauses(&mut self, waiting: usize, departures: u64) -> bool {
+        if departures != self.departures {
+            *self = Self {
+                departures,
+                fruitless: 0,
+            };
         }
         let pauses = waiting >= Self::BUSY && self.fruitless < Self::MAX_PAUSES;
         if pauses {
@@ -397,8 +400,8 @@ mod tests {
     fn accepting_pauses_while_many_connections_wait_and_are_served() {
         let mut pace = Pace::default();
         assert!(!pace.pauses(Pace::BUSY - 1, 0));
-        for left in 0..1000 {
-            assert!(pace.pauses(Pace::BUSY, left));
+        for departures in 0..1000 {
+            assert!(pace.pauses(Pace::BUSY, departures));
         }
         // No connection is served any longer.
         let pauses = (0..1000).filter(|_| pace.pauses(500, 999)).count();

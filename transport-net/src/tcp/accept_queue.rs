@@ -46,7 +46,7 @@ struct State {
     /// Number of connections that may not be read yet.
     waiting: usize,
     /// Number of connections that have left the queues so far.
-    left: u64,
+    departures: u64,
 }
 
 /// The connections of one address.
@@ -150,7 +150,7 @@ impl State {
     fn remove(&mut self, limits: &NetLimits, home: IpAddr, ticket: u64) -> Option<Entry> {
         let peer = self.peers.get_mut(&home)?;
         let entry = peer.turns.remove(&ticket)?;
-        self.left = self.left.wrapping_add(1);
+        self.departures = self.departures.wrapping_add(1);
         match entry.phase {
             Phase::Waiting => self.waiting -= 1,
             Phase::Reading | Phase::Stalled => {
@@ -328,7 +328,7 @@ impl AcceptQueue {
     /// queues so far.
     pub(crate) fn progress(&self) -> (usize, u64) {
         let state = self.0.lock();
-        (state.waiting, state.left)
+        (state.waiting, state.departures)
     }
 
     /// Ends the tasks of all connections, and admits no more.

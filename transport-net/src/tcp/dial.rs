@@ -66,7 +66,7 @@ pub(crate) async fn dial(
                 return running.fail(ConnectionEnd::unreachable(&to, &why));
             }
         },
-        end = link.leaving() => return running.fail(end),
+        end = link.end_requested() => return running.fail(end),
     };
     link.connected(Instant::now());
     let reader = FrameReader::new(limits.max_letter, BytesMut::new());

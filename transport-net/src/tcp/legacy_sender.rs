@@ -13,7 +13,7 @@ use tokio::net::TcpStream;
 use tokio::time;
 
 use super::endpoint::TcpEndpoint;
-use crate::legacy::dialect::{Here, translate};
+use crate::legacy::dialect::{ReplyAddress, translate};
 use crate::legacy::queues::{LegacyDelivery, LegacySender, Progress};
 use crate::sockets::{self, prepare};
 use crate::stream::counters::count;
@@ -46,9 +46,9 @@ impl TcpSender {
         let (endpoint, to) = (&self.endpoint, &self.to);
         let sink = endpoint.stream.sink();
         let has = |name: &str| sink.as_ref().is_some_and(|sink| sink.is_here(name));
-        let in_dialect = |here: Option<&str>| {
-            let here = here.map(|url| Here { url, has: &has });
-            translate(&delivery.letter, &delivery.receiver, to, here)
+        let in_dialect = |url: Option<&str>| {
+            let reply_address = url.map(|url| ReplyAddress { url, has: &has });
+            translate(&delivery.letter, &delivery.receiver, to, reply_address)
                 .map_err(|error| Conclusion::NotSent(TransportError::new(error.fault(), error)))
         };
         // Translated before a connection is opened: a connection without a letter leaks a
@@ -66,10 +66,10 @@ impl TcpSender {
             .check_legacy_peer(peer)
             .map_err(Conclusion::NotSent)?;
         if to.signature() == Signature::JadeProxy
-            && let Some(here) = stream.local_addr().ok()
-            && let Some(here) = listening_at(&endpoint.listening(), here)
+            && let Some(local) = stream.local_addr().ok()
+            && let Some(url) = listening_at(&endpoint.listening(), local)
         {
-            letter = in_dialect(Some(&here))?;
+            letter = in_dialect(Some(&url))?;
         }
         let broken = |error| TransportError::new(TransportErrorKind::Broken, error);
         prepare(&stream, endpoint.limits()).map_err(|error| Conclusion::NotSent(broken(error)))?;

@@ -150,7 +150,7 @@ impl Transport for TcpTransport {
         self.endpoint.abandon(attempt, to)
     }
 
-    fn left(&self, location: &Location) {
+    fn location_vacated(&self, location: &Location) {
         self.endpoint.service_left(location);
     }
 

@@ -79,7 +79,7 @@ impl Protocol for Core {
         match event {
             CoreEvent::Concluded(attempt, conclusion) => sink.concluded(attempt, conclusion),
             CoreEvent::Introduced(peer) => sink.introduced(&peer),
-            CoreEvent::Parted(peer) => sink.parted(&peer),
+            CoreEvent::Disconnected(peer) => sink.disconnected(&peer),
             CoreEvent::Arrived {
                 parcel,
                 from,

@@ -235,8 +235,8 @@ impl Datagrams {
         let mut bytes = BTreeMap::new();
         let mut count = 0;
         loop {
-            while let Some(told) = self.core.poll_event() {
-                match told {
+            while let Some(event) = self.core.poll_event() {
+                match event {
                     CoreEvent::Arrived { ticket, .. } => self.tickets.push(ticket),
                     CoreEvent::Concluded(attempt, conclusion) => {
                         assert!(attempt.0 < self.dispatched);
@@ -251,7 +251,7 @@ impl Datagrams {
                             "it is this service itself"
                         );
                     }
-                    CoreEvent::Parted(_) => {}
+                    CoreEvent::Disconnected(_) => {}
                 }
             }
             let Some(transmit) = self.core.poll_transmit(now) else {

@@ -154,8 +154,9 @@ impl Transport for UdpTransport {
         abandoned.unwrap_or(Abandoned::Unconfirmed)
     }
 
-    fn left(&self, location: &Location) {
-        self.endpoint.call(|core, now| core.left(now, location));
+    fn location_vacated(&self, location: &Location) {
+        self.endpoint
+            .call(|core, now| core.location_vacated(now, location));
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {

@@ -93,9 +93,10 @@ impl Mtu {
     }
 
     fn candidate(&self) -> Option<usize> {
-        let left = CANDIDATES.get(self.next..)?;
+        let candidates = CANDIDATES.get(self.next..)?;
         // The configured limit is probed like the other sizes.
-        left.iter()
+        candidates
+            .iter()
             .map(|size| (*size).min(self.max))
             .find(|size| *size > self.current)
     }

@@ -263,13 +263,13 @@ impl Ack {
 }
 
 pub(crate) fn put_ack(out: &mut Vec<u8>, ack: &Ack) {
-    let told = ack.before.iter().rposition(|byte| *byte != 0);
-    let told = &ack.before[..told.map_or(0, |last| last + 1)];
+    let last = ack.before.iter().rposition(|byte| *byte != 0);
+    let before = &ack.before[..last.map_or(0, |last| last + 1)];
     out.put_u8(ACK);
     out.put_u64_le(ack.largest);
     out.put_u32_le(ack.delay_us);
-    out.put_u8(told.len() as u8);
-    out.put_slice(told);
+    out.put_u8(before.len() as u8);
+    out.put_slice(before);
 }
 
 /// Appends the header of a parcel frame.
@@ -340,9 +340,9 @@ impl<'a> Frames<'a> {
                 let largest = rest.try_get_u64_le().ok()?;
                 let delay_us = rest.try_get_u32_le().ok()?;
                 let len = usize::from(rest.try_get_u8().ok()?);
-                let (told, after) = rest.split_at_checked(len)?;
+                let (received, after) = rest.split_at_checked(len)?;
                 let mut before = [0; BITMAP];
-                before.get_mut(..len)?.copy_from_slice(told);
+                before.get_mut(..len)?.copy_from_slice(received);
                 *rest = after;
                 Frame::Ack(Ack {
                     largest,

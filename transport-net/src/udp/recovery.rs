@@ -60,7 +60,7 @@ pub(crate) struct Recovery {
 struct Packet {
     at: Instant,
     size: usize,
-    kept: Vec<SentContent>,
+    contents: Vec<SentContent>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -109,12 +109,18 @@ impl Recovery {
     }
 
     /// Records a sent packet that elicits an acknowledgment.
-    pub(crate) fn sent(&mut self, number: u64, now: Instant, size: usize, kept: Vec<SentContent>) {
+    pub(crate) fn sent(
+        &mut self,
+        number: u64,
+        now: Instant,
+        size: usize,
+        contents: Vec<SentContent>,
+    ) {
         self.in_flight += size;
         self.last_sent = now;
         self.waiting_since.get_or_insert(now);
         let at = now;
-        self.sent.insert(number, Packet { at, size, kept });
+        self.sent.insert(number, Packet { at, size, contents });
     }
 
     /// Records a round-trip time.
@@ -139,7 +145,7 @@ impl Recovery {
         if ack.largest >= self.next {
             return None;
         }
-        let mut told = AckResult::default();
+        let mut result = AckResult::default();
         let numbers: Vec<u64> = self.sent.range(..=ack.largest).map(|(n, _)| *n).collect();
         let mut grown = 0;
         for number in numbers {
@@ -157,9 +163,9 @@ impl Recovery {
             if number >= self.answered {
                 grown += packet.size;
             }
-            told.arrived.extend(packet.kept);
+            result.arrived.extend(packet.contents);
         }
-        if !told.arrived.is_empty() {
+        if !result.arrived.is_empty() {
             self.backoff = 0;
             self.grow(grown);
             self.waiting_since = (!self.sent.is_empty()).then_some(now);
@@ -170,9 +176,9 @@ impl Recovery {
             .map(|(number, _)| *number)
             .collect();
         for number in lost {
-            told.lost.extend(self.lose(number));
+            result.lost.extend(self.lose(number));
         }
-        Some(told)
+        Some(result)
     }
 
     /// Handles a timeout: returns the contents of the oldest packets for retransmission.
@@ -192,7 +198,7 @@ impl Recovery {
         if self.sent.is_empty() && self.backoff == 0 {
             self.waiting_since = None;
         }
-        packet.map_or_else(Vec::new, |packet| packet.kept)
+        packet.map_or_else(Vec::new, |packet| packet.contents)
     }
 
     /// Resets the backoff when no acknowledgment is awaited.
@@ -237,7 +243,7 @@ impl Recovery {
         };
         // The loss of a probe indicates the MTU of the path, not congestion.
         let is_probe = packet
-            .kept
+            .contents
             .iter()
             .any(|k| matches!(k, SentContent::Probe(_)));
         if !is_probe && number >= self.answered {
@@ -245,7 +251,7 @@ impl Recovery {
             self.window = (self.window / 2).max(WINDOW.1);
             self.threshold = self.window;
         }
-        packet.kept
+        packet.contents
     }
 
     fn grow(&mut self, acknowledged: usize) {
@@ -312,12 +318,15 @@ mod tests {
         for _ in 0..5 {
             send(&mut recovery, now);
         }
-        let told = recovery.acknowledged(&ack(2), now).unwrap();
-        assert_eq!(told.arrived, [SentContent::Parcel(2)]);
-        assert!(told.lost.is_empty());
+        let result = recovery.acknowledged(&ack(2), now).unwrap();
+        assert_eq!(result.arrived, [SentContent::Parcel(2)]);
+        assert!(result.lost.is_empty());
         let before = recovery.window;
-        let told = recovery.acknowledged(&ack(4), now).unwrap();
-        assert_eq!(told.lost, [SentContent::Parcel(0), SentContent::Parcel(1)]);
+        let result = recovery.acknowledged(&ack(4), now).unwrap();
+        assert_eq!(
+            result.lost,
+            [SentContent::Parcel(0), SentContent::Parcel(1)]
+        );
         assert!(recovery.window < before);
         assert!(recovery.acknowledged(&ack(5), now).is_none());
     }

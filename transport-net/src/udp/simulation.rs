@@ -119,8 +119,8 @@ impl Simulation {
     fn flush(&mut self) {
         for who in [A, B] {
             loop {
-                while let Some(told) = self.cores[who].poll_event() {
-                    self.tell(who, told);
+                while let Some(event) = self.cores[who].poll_event() {
+                    self.tell(who, event);
                 }
                 let Some(transmit) = self.cores[who].poll_transmit(self.now) else {
                     if self.cores[who].has_events() {
@@ -133,13 +133,13 @@ impl Simulation {
         }
     }
 
-    fn tell(&mut self, who: usize, told: CoreEvent) {
-        match told {
+    fn tell(&mut self, who: usize, event: CoreEvent) {
+        match event {
             CoreEvent::Concluded(attempt, conclusion) => {
-                let heard = self.concluded[who].entry(attempt).or_default();
-                heard.push(conclusion);
+                let conclusions = self.concluded[who].entry(attempt).or_default();
+                conclusions.push(conclusion);
             }
-            CoreEvent::Introduced(_) | CoreEvent::Parted(_) => {}
+            CoreEvent::Introduced(_) | CoreEvent::Disconnected(_) => {}
             CoreEvent::Arrived { parcel, ticket, .. } => {
                 self.arrived[who].push(*parcel);
                 if self.random.f64() < self.late {
@@ -242,10 +242,10 @@ impl Simulation {
         assert!(order.is_sorted(), "out of order: {order:?}");
         let mut accepted = 0;
         for attempt in attempts {
-            let heard = &self.concluded[from][&AttemptId(*attempt)];
-            assert_eq!(heard.len(), 1, "{attempt}: {heard:?}");
+            let conclusions = &self.concluded[from][&AttemptId(*attempt)];
+            assert_eq!(conclusions.len(), 1, "{attempt}: {conclusions:?}");
             let arrived = arrived.contains(attempt);
-            match &heard[0] {
+            match &conclusions[0] {
                 Conclusion::Answered(Answer::Accepted) => {
                     assert!(arrived, "{attempt} was accepted but did not arrive");
                     accepted += 1;
@@ -471,7 +471,7 @@ fn unproved_peers_leave_no_state_and_get_fewer_bytes_than_they_sent() {
         load: crate::hello::Load::Any,
     };
     let spoofed = |n: u32| SocketAddr::from((n.to_be_bytes(), 99));
-    let mut told = 0;
+    let mut concluded = 0;
     for n in 1..2000_u32 {
         let cookie = if n % 2 == 0 { NO_COOKIE } else { [n as u8; 16] };
         let first = packet::hello(n.into(), &cookie, &hello);
@@ -483,10 +483,10 @@ fn unproved_peers_leave_no_state_and_get_fewer_bytes_than_they_sent() {
         while let Some(reply) = simulation.cores[B].poll_transmit(simulation.now) {
             assert_eq!(reply.path.remote, spoofed(n));
             assert!(reply.contents.len() <= data.len().max(first.len() / 30));
-            told += 1;
+            concluded += 1;
         }
     }
-    assert_eq!(told, 2 * 1999);
+    assert_eq!(concluded, 2 * 1999);
     assert_eq!(simulation.cores[B].counters().accepted, 0);
     assert_eq!(simulation.cores[B].poll_timeout(), None);
 }
@@ -801,7 +801,7 @@ fn a_connection_ends_soon_after_its_peer_has_announced_another_address() {
         // It was never at the first of these.
         for location in [elsewhere, to(B)] {
             let location = location.with_incarnation(incarnation);
-            simulation.cores[A].left(simulation.now, &location);
+            simulation.cores[A].location_vacated(simulation.now, &location);
         }
         simulation.flush();
         simulation.until_concluded(A, &BTreeSet::from([1, 2]));

@@ -33,7 +33,7 @@ pub(super) async fn dial(
     };
     let connected = tokio::select! {
         connected = connect(&directory, to.address(), limits.connect_timeout) => connected,
-        end = link.leaving() => return running.fail(end),
+        end = link.end_requested() => return running.fail(end),
     };
     let (stream, number) = match connected {
         Ok(connected) => connected,

@@ -101,18 +101,18 @@ pub(crate) fn answer_tls(
 ) -> (SocketAddr, std::thread::JoinHandle<Result<Vec<u8>, String>>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let at = listener.local_addr().unwrap();
-    let heard = std::thread::spawn(move || {
+    let received = std::thread::spawn(move || {
         let (stream, _) = listener.accept().unwrap();
         stream.set_read_timeout(Some(WATCHDOG)).unwrap();
         let session = ServerConnection::new(Arc::new(config)).unwrap();
-        let mut heard = vec![0; 24];
+        let mut received = vec![0; 24];
         let mut stream = StreamOwned::new(session, stream);
-        let read = stream.read_exact(&mut heard);
+        let read = stream.read_exact(&mut received);
         read.and_then(|()| stream.write_all(&answer))
             .map_err(|error| error.to_string())?;
-        Ok(heard)
+        Ok(received)
     });
-    (at, heard)
+    (at, received)
 }
 
 /// Returns a QUIC configuration with this TLS configuration, protocol and version.

@@ -341,7 +341,7 @@ pub fn shared_content_arrives_at_all_receivers(fixture: &dyn Fixture) {
     );
     let len = 100_000.min(a.transport.max_letter() / 2);
     let filled = |round: u64| Bytes::from(vec![round as u8; len]);
-    let mut kept = Vec::new();
+    let mut contents = Vec::new();
     for round in 0..40 {
         let loan = a.transport.loan_for_many(len);
         let content = match loan {
@@ -369,7 +369,7 @@ pub fn shared_content_arrives_at_all_receivers(fixture: &dyn Fixture) {
             assert_same(&to.arrived(to.arrivals() - 1), &sent);
         }
         if round < 20 {
-            kept.push(content);
+            contents.push(content);
             continue;
         }
         for receiver in [&b, &c] {
@@ -378,10 +378,10 @@ pub fn shared_content_arrives_at_all_receivers(fixture: &dyn Fixture) {
                 assert_same(arrived, &sent);
             }
         }
-        let own = kept.iter().enumerate();
-        own.for_each(|(round, kept)| assert!(*kept == filled(round as u64), "changed"));
+        let own = contents.iter().enumerate();
+        own.for_each(|(round, content)| assert!(*content == filled(round as u64), "changed"));
         // The sender releases its contents, and the receivers in turn release theirs.
-        kept.clear();
+        contents.clear();
         let receiver = if round % 2 == 0 { &b } else { &c };
         receiver.sink.record.lock().arrivals.clear();
     }

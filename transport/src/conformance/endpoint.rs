@@ -25,7 +25,7 @@ pub(super) struct Record {
     pub(super) concluded: HashMap<AttemptId, Vec<Conclusion>>,
     /// Numbers of connections that were opened, and that have ended.
     pub(super) introduced: usize,
-    pub(super) parted: usize,
+    pub(super) disconnected: usize,
 }
 
 pub(super) struct RecordingSink {
@@ -62,8 +62,8 @@ impl Sink for RecordingSink {
         self.record.lock().introduced += 1;
     }
 
-    fn parted(&self, _: &Introduction) {
-        self.record.lock().parted += 1;
+    fn disconnected(&self, _: &Introduction) {
+        self.record.lock().disconnected += 1;
     }
 }
 

@@ -132,10 +132,10 @@ pub fn contradictions_end_a_connection(fixture: &dyn Fixture) {
     }
     let counts = || {
         let record = a.sink.record.lock();
-        (record.introduced, record.parted)
+        (record.introduced, record.disconnected)
     };
-    let (introduced, parted) = counts();
-    assert_eq!(parted, 0);
+    let (introduced, disconnected) = counts();
+    assert_eq!(disconnected, 0);
     let (conclusion, expected) = send(7);
     match introduced {
         0 => assert_eq!(conclusion, expected),
@@ -145,8 +145,8 @@ pub fn contradictions_end_a_connection(fixture: &dyn Fixture) {
         ),
     }
     until(&[&a, &b], "the end of the connection", || {
-        let (_, parted) = counts();
-        (parted == introduced).then_some(())
+        let (_, disconnected) = counts();
+        (disconnected == introduced).then_some(())
     });
     // Another connection can be opened.
     let (conclusion, expected) = send(6);

@@ -35,13 +35,13 @@ pub(super) fn run(
             output::text(&format!("watching domain {domain}; press Ctrl-C to stop\n"))?;
         }
         let mut shown = Shown {
-            left: count,
+            lines_left: count,
             ..Shown::default()
         };
         let mut over = pin!(options::after(time));
         let mut printed = shown.all(directory, filter, ChangeKind::Present, json);
         loop {
-            if printed.is_err() || shown.left == Some(0) {
+            if printed.is_err() || shown.lines_left == Some(0) {
                 break;
             }
             tokio::select! {
@@ -89,7 +89,7 @@ impl ChangeKind {
 struct Shown {
     entries: BTreeMap<Arc<str>, Arc<Entry>>,
     /// Number of lines that are left to print; `None` without a limit.
-    left: Option<u64>,
+    lines_left: Option<u64>,
 }
 
 impl Shown {
@@ -175,9 +175,9 @@ impl Shown {
         directory: DirectoryView<'_>,
         json: bool,
     ) -> Result<(), Failure> {
-        match &mut self.left {
+        match &mut self.lines_left {
             Some(0) => return Ok(()),
-            Some(left) => *left -= 1,
+            Some(lines_left) => *lines_left -= 1,
             None => {}
         }
         print(change, entry, directory, json)

@@ -247,12 +247,12 @@ impl Processes {
             process.end().await;
         }
         self.by_name.clear();
-        let left = self.files();
-        for file in &left {
+        let remaining = self.files();
+        for file in &remaining {
             let _ = std::fs::remove_file(file);
         }
         let _ = std::fs::remove_dir_all(self.runtime_dir.path());
-        left
+        remaining
     }
 }
 

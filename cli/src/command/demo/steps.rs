@@ -49,7 +49,7 @@ pub(super) async fn run(verbose: bool) -> Result<Report, Failure> {
         () = demo.all() => false,
         () = stop.requested() => true,
     };
-    let left = demo.processes.clear().await;
+    let remaining = demo.processes.clear().await;
     if interrupted {
         return Err(Failure::failed(
             "interrupted; all processes of the demo have ended and no files are left",
@@ -57,7 +57,7 @@ pub(super) async fn run(verbose: bool) -> Result<Report, Failure> {
             "run the demo again",
         ));
     }
-    demo.last_step(&left);
+    demo.last_step(&remaining);
     let measured = demo.measured();
     Ok(Report {
         steps: demo.steps,
@@ -659,12 +659,12 @@ impl Demo {
     }
 
     /// Checks that no files are left.
-    fn last_step(&mut self, left: &[std::path::PathBuf]) {
-        let found = match left {
+    fn last_step(&mut self, remaining: &[std::path::PathBuf]) {
+        let found = match remaining {
             [] => found!("left": 0),
             [first, ..] => Err(format!(
                 "{} files were left, the first is {}",
-                left.len(),
+                remaining.len(),
                 first.display()
             )),
         };

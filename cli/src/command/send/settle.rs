@@ -51,14 +51,14 @@ pub(super) async fn proposals(
     }
     // A proposal that comes later finds its initiator gone. The result of a quick agent may be among
     // these messages, too.
-    let mut early = Vec::new();
+    let mut arrived = Vec::new();
     while let Ok(Some(late)) = agent.try_receive() {
         match is_proposal(late.message()) && late.message().is_reply_to(sent) {
             true => settled.answer(agent, late.message(), arguments).await?,
-            false => early.push(late),
+            false => arrived.push(late),
         }
     }
-    settled.wait(agent, sent, early, arguments).await?;
+    settled.wait(agent, sent, arrived, arguments).await?;
     let bid = |name: &&AgentId| settled.accepted.iter().any(|bid| bid == name.name());
     let absent = arguments.accept.iter().filter(|name| !bid(name));
     let absent: Vec<&str> = absent.map(AgentId::name).collect();
@@ -110,11 +110,11 @@ impl Settled {
         &mut self,
         agent: &Agent,
         sent: &Message,
-        early: Vec<Incoming>,
+        arrived: Vec<Incoming>,
         arguments: &Arguments,
     ) -> Result<(), Failure> {
         let mut working = self.accepted.clone();
-        let mut early = early.into_iter();
+        let mut arrived = arrived.into_iter();
         let mut partners = agent.watch_partners();
         for name in &working {
             partners.add(name);
@@ -126,7 +126,7 @@ impl Settled {
             let received = tokio::select! {
                 biased;
                 received = async {
-                    match early.next() {
+                    match arrived.next() {
                         Some(incoming) => Ok(incoming),
                         None => agent.receive().await,
                     }

@@ -23,8 +23,8 @@ pub(super) fn letter(passage: &Passage, checked: &CheckResult) -> String {
         .content_len
         .is_some_and(|len| len > passage.content.len() as u64 && !passage.content.is_empty());
     let submission = passage
-        .send
-        .map(|send| format!("{}/{send}", passage.stream.sender));
+        .submission
+        .map(|submission| format!("{}/{submission}", passage.stream.sender));
     let mut object = Map::new();
     let mut put = |key: &str, value: Option<Value>| {
         if let Some(value) = value {

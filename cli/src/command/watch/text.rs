@@ -277,7 +277,7 @@ fn row(columns: &Columns, cells: [String; 8], verdict: &str) -> String {
         outcome,
     ] = cells;
     let gap = if columns.narrow { " " } else { "  " };
-    let left = [
+    let cells = [
         (time, columns.time),
         (agents, columns.agents),
         (performative, columns.performative),
@@ -285,7 +285,7 @@ fn row(columns: &Columns, cells: [String; 8], verdict: &str) -> String {
         (conversation, columns.conversation),
     ];
     let mut text = String::new();
-    for (cell, width) in left {
+    for (cell, width) in cells {
         text.push_str(&fitted(&cell, width));
         text.push_str(gap);
     }
@@ -325,11 +325,11 @@ pub(super) fn cut(text: &str, width: usize) -> String {
     if text.width() <= width {
         return text.to_owned();
     }
-    let mut left = width.saturating_sub(1);
+    let mut columns_left = width.saturating_sub(1);
     let fits = |c: &char| {
         let needed = c.width().unwrap_or(0);
-        let fits = needed <= left;
-        left = left.saturating_sub(needed);
+        let fits = needed <= columns_left;
+        columns_left = columns_left.saturating_sub(needed);
         fits
     };
     let mut short: String = text.chars().take_while(fits).collect();

@@ -41,7 +41,7 @@ impl Lane {
         let State::UnderWay { location, .. } = std::mem::replace(state, State::Ended) else {
             return;
         };
-        self.back();
+        self.end_transit();
         self.record_event(now, index);
         // The timer visits the letter again, also if its deadline passed in the meantime.
         self.due_at(match self.returning {
@@ -114,8 +114,8 @@ impl Lane {
                 self.settled_by_report(now, index, taken_by, outcome, table);
             }
             Answer::Custody => {
-                let delivery = &mut self.letters[index];
-                delivery.progress.state = State::Custody {
+                let open_letter = &mut self.letters[index];
+                open_letter.progress.state = State::Custody {
                     attempt,
                     location,
                     since: now,
@@ -128,10 +128,10 @@ impl Lane {
             }
             Answer::Busy => {
                 self.was_full(now);
-                let delivery = &mut self.letters[index];
-                delivery.progress.busy = true;
-                self.busy_at = delivery.handed_at(&location);
-                delivery.custody_taken(table);
+                let open_letter = &mut self.letters[index];
+                open_letter.progress.busy = true;
+                self.busy_at = open_letter.handed_at(&location);
+                open_letter.custody_taken(table);
                 self.again(now, index, Cause::Busy, table);
             }
             Answer::OutOfOrder { last } => {
@@ -157,11 +157,11 @@ impl Lane {
 
     /// Handles an answer that this registration of the receiver recently left its host.
     fn receiver_moved(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
-        let delivery = &self.letters[index];
-        let registration = delivery.registration;
+        let open_letter = &self.letters[index];
+        let registration = open_letter.registration;
         if self.is_custody() {
             self.recovering = true;
-            match rules::may_move(delivery.progress.uncertain) {
+            match rules::may_move(open_letter.progress.uncertain) {
                 true => self.settle(now, index, Settlement::Moved, table),
                 false => self.fail(now, index, FailureReason::Unconfirmed, table),
             }
@@ -204,8 +204,8 @@ impl Lane {
         self.awaited = None;
         self.is_fresh = true;
         let departed = self.letters.iter();
-        let departed = departed.filter(|delivery| delivery.progress.departure.is_some());
-        let departed: Vec<u64> = departed.map(|delivery| delivery.sequence).collect();
+        let departed = departed.filter(|open_letter| open_letter.progress.departure.is_some());
+        let departed: Vec<u64> = departed.map(|open_letter| open_letter.sequence).collect();
         for sequence in departed {
             let Some(index) = self.index(sequence) else {
                 continue;
@@ -322,11 +322,11 @@ impl Lane {
         let Some(index) = self.index(sequence) else {
             return;
         };
-        let delivery = &mut self.letters[index];
-        if delivery.registration != registration {
+        let open_letter = &mut self.letters[index];
+        if open_letter.registration != registration {
             return;
         }
-        let told = match &report {
+        let reported = match &report {
             Report::Settled(Outcome::Delivered { .. } | Outcome::Sent { .. }) => {
                 CustodyReport::Delivered
             }
@@ -340,13 +340,18 @@ impl Lane {
             // An unknown outcome of a later version carries no information.
             Report::Settled(_) => CustodyReport::NotDelivered { uncertain: true },
         };
-        let handed = delivery.was_handed_to(from);
-        let current = delivery.progress.state.handed_over();
+        let handed = open_letter.was_handed_to(from);
+        let current = open_letter.progress.state.handed_over();
         let current = current.map(|(attempt, location)| (attempt.0, location.kind()));
-        match rules::believe(handed, told, transfer, current.map(|(attempt, _)| attempt)) {
+        match rules::believe(
+            handed,
+            reported,
+            transfer,
+            current.map(|(attempt, _)| attempt),
+        ) {
             Belief::Believed => {}
             Belief::OnlyUncertain => {
-                delivery.ended(AttemptEnd::Unknown);
+                open_letter.ended(AttemptEnd::Unknown);
                 return;
             }
             Belief::Ignored => return,
@@ -354,7 +359,7 @@ impl Lane {
         let taken_by = match current {
             Some((_, kind)) => Some(kind),
             // An attempt without an answer delivered it, most likely the last one.
-            None => delivery.progress.attempts.last().map(|it| it.via),
+            None => open_letter.progress.attempts.last().map(|it| it.via),
         };
         self.end_hand_over(index, transfer, table);
         self.record_event(now, index);
@@ -388,7 +393,7 @@ impl Lane {
                     Tally::add(&tally.taken);
                 }
             }
-            self.back();
+            self.end_transit();
         }
     }
 
@@ -406,8 +411,8 @@ impl Lane {
             Some(ours) if ours.is_host_local() => theirs,
             Some(ours) => ours,
         };
-        let delivery = &mut self.letters[index];
-        let mut attempts = std::mem::take(&mut delivery.progress.attempts);
+        let open_letter = &mut self.letters[index];
+        let mut attempts = std::mem::take(&mut open_letter.progress.attempts);
         attempts.extend_from_slice(outcome.attempts());
         let outcome = match outcome {
             Outcome::Delivered { via, .. } => Outcome::Delivered {
@@ -419,7 +424,7 @@ impl Lane {
                 attempts,
             },
             Outcome::Failed { reason, .. } => {
-                delivery.progress.attempts = attempts;
+                open_letter.progress.attempts = attempts;
                 if reason == FailureReason::QueueFull {
                     self.was_full(now);
                 }
@@ -495,10 +500,10 @@ impl Lane {
     /// `index`, if that is one of them.
     fn record_event(&mut self, now: Instant, index: usize) {
         let registration = self.letters[index].registration;
-        if let Some((ended, heard)) = &mut self.ended
+        if let Some((ended, last_event)) = &mut self.ended
             && *ended == registration
         {
-            *heard = now;
+            *last_event = now;
         }
     }
 
@@ -511,8 +516,8 @@ impl Lane {
         entry: &Entry,
         table: &mut AttemptTable,
     ) {
-        let delivery = &mut self.letters[index];
-        let Some((_, location)) = delivery.progress.state.handed_over() else {
+        let open_letter = &mut self.letters[index];
+        let Some((_, location)) = open_letter.progress.state.handed_over() else {
             return;
         };
         let service = location.incarnation();
@@ -520,11 +525,11 @@ impl Lane {
         let is_there = entry.locations.iter().any(stands);
         let has_left =
             || table.routes.service_has_left(location) && !entry.locations.contains(location);
-        let is_under_way = matches!(delivery.progress.state, State::UnderWay { .. });
+        let is_under_way = matches!(open_letter.progress.state, State::UnderWay { .. });
         if !service.is_known() || (is_there && !(is_under_way && has_left())) {
             return;
         }
-        match &mut delivery.progress.state {
+        match &mut open_letter.progress.state {
             State::UnderWay {
                 attempt,
                 location,

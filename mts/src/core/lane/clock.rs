@@ -21,7 +21,7 @@ impl Lane {
         self.ask_custodians(now, table);
         let ended = self
             .ended
-            .filter(|(_, heard)| now >= *heard + ENDED_TIMEOUT);
+            .filter(|(_, last_event)| now >= *last_event + ENDED_TIMEOUT);
         // Once for due timers, and once for the next ones.
         work::steps(2 * self.letters.len());
         let (mut index, mut answered, before) = (0, 0, self.letters.len());
@@ -30,16 +30,16 @@ impl Lane {
                 self.due = Some(now);
                 return false;
             }
-            let Some(delivery) = self.letters.get_mut(index) else {
+            let Some(open_letter) = self.letters.get_mut(index) else {
                 break;
             };
-            let expired = delivery.deadline <= now;
-            let abandoned = ended.is_some_and(|(gone, _)| gone == delivery.registration);
-            if delivery.custody_due.is_some_and(|due| due <= now) {
-                delivery.custody_taken(table);
+            let expired = open_letter.deadline <= now;
+            let abandoned = ended.is_some_and(|(gone, _)| gone == open_letter.registration);
+            if open_letter.custody_due.is_some_and(|due| due <= now) {
+                open_letter.custody_taken(table);
                 answered += 1;
             }
-            match &mut delivery.progress.state {
+            match &mut open_letter.progress.state {
                 State::UnderWay {
                     attempt,
                     location,
@@ -61,7 +61,7 @@ impl Lane {
                 State::Custody { location, .. } if expired || abandoned => {
                     let location = location.clone();
                     let text = "the gateway that has the letter in custody has not reported";
-                    delivery.failed_at(
+                    open_letter.failed_at(
                         &location,
                         TransportError::new(TransportErrorKind::TimedOut, text),
                     );
@@ -79,7 +79,7 @@ impl Lane {
                 }
                 State::Ended => debug_assert!(false, "a letter came back without a decision"),
                 State::Waiting(_) => {
-                    if let Some(Holding::Until(until)) = delivery.progress.hold
+                    if let Some(Holding::Until(until)) = open_letter.progress.hold
                         && until <= now
                     {
                         self.return_letter(now, index, table);
@@ -99,29 +99,29 @@ impl Lane {
     }
 
     fn next_due(&self, now: Instant) -> Option<Instant> {
-        let letters = self.letters.iter().flat_map(|delivery| {
-            let progress = &delivery.progress;
+        let letters = self.letters.iter().flat_map(|open_letter| {
+            let progress = &open_letter.progress;
             // The conclusion of an abandoned attempt follows at once, and decides about the letter.
             let (deadline, times_out) = match &progress.state {
                 State::UnderWay {
                     abandoned: true, ..
                 } => (None, None),
-                State::UnderWay { times_out, .. } => (Some(delivery.deadline), Some(*times_out)),
-                _ => (Some(delivery.deadline), None),
+                State::UnderWay { times_out, .. } => (Some(open_letter.deadline), Some(*times_out)),
+                _ => (Some(open_letter.deadline), None),
             };
             let held = match progress.hold {
                 Some(Holding::Until(until)) => Some(until),
                 _ => None,
             };
-            let turn = delivery.begins_after(now);
-            [deadline, delivery.custody_due, times_out, held, turn]
+            let turn = open_letter.begins_after(now);
+            [deadline, open_letter.custody_due, times_out, held, turn]
         });
         let paused = self.pause.map(|pause| pause.until);
         let paused = paused.filter(|until| *until > now);
         let still =
             |wait: Option<(_, Instant)>| wait.map(|(_, until)| until).filter(|until| *until > now);
         let (moving, absent) = (still(self.moving), still(self.absent));
-        let ended = self.ended.map(|(_, heard)| heard + ENDED_TIMEOUT);
+        let ended = self.ended.map(|(_, last_event)| last_event + ENDED_TIMEOUT);
         let ended = ended.filter(|due| *due > now);
         let ask = self.ask_custodian.filter(|due| *due > now);
         let others = [paused, moving, absent, ended, ask];

@@ -47,9 +47,9 @@ impl Lane {
         let Some(index) = self.index(sequence) else {
             return Err(upstream);
         };
-        let delivery = &mut self.letters[index];
-        delivery.custody_taken(table);
-        delivery.add_upstream(upstream);
+        let open_letter = &mut self.letters[index];
+        open_letter.custody_taken(table);
+        open_letter.add_upstream(upstream);
         self.lower_predecessor(index, after, table);
         self.pump(now, table);
         Ok(())
@@ -100,12 +100,12 @@ impl Lane {
         let mut asked = 0;
         let mut next: Option<Instant> = None;
         for index in 0..self.letters.len() {
-            let delivery = &self.letters[index];
+            let open_letter = &self.letters[index];
             let State::Custody {
                 attempt,
                 location,
                 since,
-            } = &delivery.progress.state
+            } = &open_letter.progress.state
             else {
                 continue;
             };
@@ -119,12 +119,12 @@ impl Lane {
             }
             asked += 1;
             let (attempt, location) = (*attempt, location.clone());
-            let stream = self.stream_of(delivery);
+            let stream = self.stream_of(open_letter);
             let after = self.after(index);
-            let letter = (delivery.sequence, after, attempt.0);
+            let letter = (open_letter.sequence, after, attempt.0);
             table.predecessor(stream, self.receiver.clone(), letter, location);
-            let delivery = &mut self.letters[index];
-            delivery.after = delivery.after.min(after);
+            let open_letter = &mut self.letters[index];
+            open_letter.after = open_letter.after.min(after);
         }
         if asked > 0 {
             next = Some(now + ASK_CUSTODIAN_AGAIN);
@@ -166,9 +166,9 @@ impl Lane {
         (registration, sequence, transfer): (Incarnation, u64, u64),
     ) -> Option<usize> {
         let index = self.index(sequence)?;
-        let delivery = &self.letters[index];
-        let is_meant = delivery.registration == registration
-            && matches!(delivery.progress.state, State::Custody { attempt, .. } if attempt.0 == transfer);
+        let open_letter = &self.letters[index];
+        let is_meant = open_letter.registration == registration
+            && matches!(open_letter.progress.state, State::Custody { attempt, .. } if attempt.0 == transfer);
         is_meant.then_some(index)
     }
 
@@ -180,10 +180,10 @@ impl Lane {
         text: &'static str,
         table: &mut AttemptTable,
     ) {
-        let delivery = &mut self.letters[index];
-        if let State::Custody { location, .. } = &delivery.progress.state {
+        let open_letter = &mut self.letters[index];
+        if let State::Custody { location, .. } = &open_letter.progress.state {
             let location = location.clone();
-            delivery.ended(AttemptEnd::CustodianLost);
+            open_letter.ended(AttemptEnd::CustodianLost);
             let error = TransportError::new(TransportErrorKind::Broken, text);
             self.came_back(now, index, &location, (error, Cause::CustodianLost), table);
         }
@@ -191,21 +191,21 @@ impl Lane {
 
     fn lower_predecessor(&mut self, index: usize, after: u64, table: &mut AttemptTable) {
         let stream = self.stream_of(&self.letters[index]);
-        let delivery = &mut self.letters[index];
-        let lower = rules::lower(delivery.after, after);
-        if lower == delivery.after {
+        let open_letter = &mut self.letters[index];
+        let lower = rules::lower(open_letter.after, after);
+        if lower == open_letter.after {
             return;
         }
-        delivery.after = lower;
-        match &delivery.progress.state {
+        open_letter.after = lower;
+        match &open_letter.progress.state {
             State::Waiting(_) | State::Ended => {
-                delivery.progress.hold = None;
-                let sequence = delivery.sequence;
+                open_letter.progress.hold = None;
+                let sequence = open_letter.sequence;
                 self.end_pause(PauseEnd::LowerPredecessor(sequence));
             }
             State::UnderWay { location, .. } | State::Custody { location, .. } => {
-                let (sequence, location) = (delivery.sequence, location.clone());
-                let transfer = delivery.progress.state.handed_over();
+                let (sequence, location) = (open_letter.sequence, location.clone());
+                let transfer = open_letter.progress.state.handed_over();
                 let transfer = transfer.map_or(0, |(attempt, _)| attempt.0);
                 let receiver = self.receiver.clone();
                 table.predecessor(stream, receiver, (sequence, lower, transfer), location);
@@ -218,17 +218,19 @@ impl Lane {
         if !self.is_custody() {
             return false;
         }
-        let delivery = &self.letters[index];
-        if matches!(delivery.progress.hold, Some(Holding::Until(_))) {
+        let open_letter = &self.letters[index];
+        if matches!(open_letter.progress.hold, Some(Holding::Until(_))) {
             return true;
         }
-        let Some(predecessor) = self.index(delivery.after) else {
+        let Some(predecessor) = self.index(open_letter.after) else {
             return false;
         };
         match self.letters[predecessor].progress.state.handed_over() {
             None => true,
             // A letter on the same route arrives behind it, unless it already came back from there.
-            Some((attempt, _)) => delivery.progress.hold == Some(Holding::ForPredecessor(attempt)),
+            Some((attempt, _)) => {
+                open_letter.progress.hold == Some(Holding::ForPredecessor(attempt))
+            }
         }
     }
 
@@ -241,12 +243,12 @@ impl Lane {
         timeout: Duration,
         table: &mut AttemptTable,
     ) {
-        let delivery = &self.letters[index];
-        let after = delivery.after;
-        let since = self.left.since(after).unwrap_or(delivery.since);
+        let open_letter = &self.letters[index];
+        let after = open_letter.after;
+        let since = self.past_letters.since(after).unwrap_or(open_letter.since);
         let missing_for = now.saturating_duration_since(since);
-        let here = self.index(after).is_some();
-        match rules::hold(here, missing_for, timeout) {
+        let holds_predecessor = self.index(after).is_some();
+        match rules::hold(holds_predecessor, missing_for, timeout) {
             HoldDecision::ForPredecessor => {
                 let predecessor = self.index(after).map(|at| &self.letters[at]);
                 let attempt = predecessor.and_then(|it| it.progress.state.handed_over());
@@ -265,8 +267,8 @@ impl Lane {
 
     /// Returns a letter to the services that handed it over.
     pub(super) fn return_letter(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
-        let delivery = &self.letters[index];
-        let (sequence, uncertain) = (delivery.sequence, delivery.progress.uncertain);
+        let open_letter = &self.letters[index];
+        let (sequence, uncertain) = (open_letter.sequence, open_letter.progress.uncertain);
         self.settle(now, index, Settlement::Returned { uncertain }, table);
         // The letter behind it cannot be taken before it. With a wait of its own, a lane would return
         // one letter for each wait.
@@ -287,18 +289,18 @@ impl Lane {
         }
         self.holds = false;
         work::steps(self.letters.len());
-        for delivery in &mut self.letters {
-            if delivery.after == sequence {
-                delivery.progress.hold = None;
+        for open_letter in &mut self.letters {
+            if open_letter.after == sequence {
+                open_letter.progress.hold = None;
             }
-            self.holds |= matches!(delivery.progress.hold, Some(Holding::Until(_)));
+            self.holds |= matches!(open_letter.progress.hold, Some(Holding::Until(_)));
         }
     }
 }
 
 /// Letters that left a lane without being delivered, or after repetitions, and may come again.
 #[derive(Debug, Default)]
-pub(super) struct LettersLeft {
+pub(super) struct PastLetters {
     /// Sequences, and paces as they were when the letters left.
     latest: VecDeque<(u64, Pace)>,
     /// The highest sequence, and the slowest pace, of those that left earlier.
@@ -307,13 +309,13 @@ pub(super) struct LettersLeft {
     highest: u64,
 }
 
-impl LettersLeft {
+impl PastLetters {
     pub(super) fn is_empty(&self) -> bool {
         self.latest.is_empty()
     }
 
     /// Records a letter that leaves. The hand-over that has delivered it did not come back, and counts, too.
-    pub(super) fn push(&mut self, now: Instant, delivery: &OpenLetter, delivered: bool) {
+    pub(super) fn push(&mut self, now: Instant, open_letter: &OpenLetter, delivered: bool) {
         if self.latest.len() >= MAX_LEFT
             && let Some((sequence, pace)) = self.latest.pop_front()
         {
@@ -322,12 +324,12 @@ impl LettersLeft {
                 None => (sequence, pace),
             });
         }
-        let mut pace = delivery.progress.hand_overs.pace().leaked(now);
+        let mut pace = open_letter.progress.hand_overs.pace().leaked(now);
         if delivered {
-            pace.count(now, delivery.letter.len());
+            pace.count(now, open_letter.letter.len());
         }
-        self.latest.push_back((delivery.sequence, pace));
-        self.highest = self.highest.max(delivery.sequence);
+        self.latest.push_back((open_letter.sequence, pace));
+        self.highest = self.highest.max(open_letter.sequence);
     }
 
     /// The time at which this letter left, if it is known.

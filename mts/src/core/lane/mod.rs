@@ -9,7 +9,7 @@
 //! letter.
 //!
 //! This module dispatches letters; [`answers`] handles answers and reports, [`clock`] timeouts,
-//! [`custody`] predecessors at custodians, [`delivery`] the state of one letter, [`turns`] the times
+//! [`custody`] predecessors at custodians, [`open_letter`] the state of one letter, [`turns`] the times
 //! at which it may be dispatched, [`pause`] letters that came back, [`tried`] the attempts that are
 //! reported for letters that were never dispatched, [`trust`] withdrawn certificates.
 //!
@@ -34,7 +34,7 @@ use fipa_transport::{
     TransportError, TransportErrorKind,
 };
 
-use self::custody::LettersLeft;
+use self::custody::PastLetters;
 pub(crate) use self::open_letter::OpenLetter;
 use self::open_letter::State;
 use self::pause::Pause;
@@ -135,7 +135,7 @@ pub(crate) struct Lane {
     ask_custodian: Option<Instant>,
     /// Whether a letter may wait for its predecessor to arrive.
     holds: bool,
-    left: LettersLeft,
+    past_letters: PastLetters,
     /// Earliest time at which a timer of this lane is due.
     due: Option<Instant>,
     /// Time at which the core's timer visits this lane next.
@@ -184,7 +184,7 @@ impl Lane {
             ended: None,
             ask_custodian: None,
             holds: false,
-            left: LettersLeft::default(),
+            past_letters: PastLetters::default(),
             due: None,
             scheduled: None,
             congested: 0,
@@ -213,21 +213,21 @@ impl Lane {
 
     /// Whether later letters depend on the state of this lane.
     pub(crate) fn remembers(&self) -> bool {
-        !self.left.is_empty()
+        !self.past_letters.is_empty()
     }
 
     fn is_custody(&self) -> bool {
         matches!(self.key, LaneKey::Custody(_))
     }
 
-    fn stream_of(&self, delivery: &OpenLetter) -> Stream {
+    fn stream_of(&self, open_letter: &OpenLetter) -> Stream {
         let realm = match self.key {
             LaneKey::Custody(stream) => stream.realm,
             LaneKey::Name(..) | LaneKey::Service(_) => Realm::UNPROVED,
         };
         Stream {
             realm,
-            ..Stream::between(self.sender, delivery.registration)
+            ..Stream::between(self.sender, open_letter.registration)
         }
     }
 
@@ -295,7 +295,7 @@ impl Lane {
         if self.has_room(len, table) && self.fits_into_custody(len, table) {
             return true;
         }
-        let highest = self.letters.back().map(|delivery| delivery.sequence);
+        let highest = self.letters.back().map(|open_letter| open_letter.sequence);
         rules::admits_when_full(highest, sequence)
             && self.letters.len() < 2 * config.lane
             && self.bytes.saturating_add(len) <= config.lane_bytes.saturating_mul(2)
@@ -340,33 +340,33 @@ impl Lane {
     }
 
     /// Inserts a letter at its position in the order.
-    pub(crate) fn push(&mut self, mut delivery: Box<OpenLetter>, table: &mut AttemptTable) {
-        delivery.position = self.pushed;
+    pub(crate) fn push(&mut self, mut open_letter: Box<OpenLetter>, table: &mut AttemptTable) {
+        open_letter.position = self.pushed;
         self.pushed += 1;
-        let len = delivery.letter.len();
+        let len = open_letter.letter.len();
         let counted = self.counted(len);
         table.custody.hold(&self.receiver, counted, &table.config);
         self.bytes += len;
-        self.due_at(delivery.deadline);
-        if let Some(due) = delivery.custody_due {
+        self.due_at(open_letter.deadline);
+        if let Some(due) = open_letter.custody_due {
             self.due_at(due);
         }
-        let sequence = delivery.sequence;
-        if let Some(pace) = self.left.take(sequence) {
-            delivery.came_before(pace);
+        let sequence = open_letter.sequence;
+        if let Some(pace) = self.past_letters.take(sequence) {
+            open_letter.came_before(pace);
         }
         let place = self
             .letters
             .partition_point(|other| other.sequence < sequence);
-        self.letters.insert(place, delivery);
+        self.letters.insert(place, open_letter);
         self.predecessor_came(sequence);
     }
 
     /// Records a service that is held back. It gets a credit when letters have left this lane; while there
     /// are none, letters of other lanes have to leave, and the service tries again after a pause.
-    pub(crate) fn wait_for_credit(&mut self, back: Location) {
+    pub(crate) fn wait_for_credit(&mut self, upstream: Location) {
         if !self.letters.is_empty() {
-            self.waiting = Some(back);
+            self.waiting = Some(upstream);
         }
     }
 
@@ -388,7 +388,7 @@ impl Lane {
     }
 
     fn dispatch_waiting(&mut self, now: Instant, table: &mut AttemptTable) {
-        let (mut index, mut left) = (0, 0);
+        let (mut index, mut failed) = (0, 0);
         while index < self.letters.len() && self.under_way < table.config.window {
             work::steps(1);
             let registration = self.letters[index].registration;
@@ -412,8 +412,8 @@ impl Lane {
                 if !self.receiver_left(now, index, table) {
                     break;
                 }
-                left += 1;
-                if left >= ENDED_AT_ONCE {
+                failed += 1;
+                if failed >= ENDED_AT_ONCE {
                     self.want_refresh(table);
                     break;
                 }
@@ -489,30 +489,30 @@ impl Lane {
         }
         let attempt = table.next_attempt();
         let stream = self.stream_of(&self.letters[index]);
-        let delivery = &mut self.letters[index];
-        delivery.after = after;
-        let left = delivery.deadline.saturating_duration_since(now);
+        let open_letter = &mut self.letters[index];
+        open_letter.after = after;
+        let time_left = open_letter.deadline.saturating_duration_since(now);
         let parcel = Parcel {
             receiver: Arc::clone(&self.receiver),
             stream,
-            sequence: delivery.sequence,
+            sequence: open_letter.sequence,
             after,
             transfer: attempt.0,
-            remaining: left - HOP_MARGIN.min(left / 8),
-            body: Body::Letter(delivery.letter.clone()),
+            remaining: time_left - HOP_MARGIN.min(time_left / 8),
+            body: Body::Letter(open_letter.letter.clone()),
         };
-        let allowance = transfer_time(delivery.letter.len());
+        let allowance = transfer_time(open_letter.letter.len());
         let times_out = now + table.config.timeout_at(&route) + allowance;
         let purpose = Purpose::Letter {
             lane: self.id,
-            sequence: delivery.sequence,
+            sequence: open_letter.sequence,
         };
         table.dispatch(attempt, purpose, route.clone(), parcel);
-        delivery.handed_to(&route, local);
-        delivery.progress.tried.push(route.clone());
-        delivery.progress.hold = None;
+        open_letter.handed_to(&route, local);
+        open_letter.progress.tried.push(route.clone());
+        open_letter.progress.hold = None;
         (self.is_abroad, self.absent) = (!local, None);
-        delivery.progress.state = State::UnderWay {
+        open_letter.progress.state = State::UnderWay {
             attempt,
             location: route.clone(),
             times_out,
@@ -526,13 +526,13 @@ impl Lane {
     /// The predecessor with which the letter at `index` is dispatched: at a custodian the one it
     /// came with, at the sender's process the nearest open letter before it.
     fn after(&self, index: usize) -> u64 {
-        let delivery = &self.letters[index];
+        let open_letter = &self.letters[index];
         if self.is_custody() {
-            return delivery.after;
+            return open_letter.after;
         }
         // Of all registrations: a letter that waits for a new one must not be passed over either.
         let open = self.letters.iter().take(index);
-        rules::predecessor(open.map(|other| other.sequence), delivery.sequence)
+        rules::predecessor(open.map(|other| other.sequence), open_letter.sequence)
     }
 
     /// The counters of the current route, looked up only when the route changes.
@@ -552,7 +552,7 @@ impl Lane {
     }
 
     /// Records that a letter is no longer in transit.
-    fn back(&mut self) {
+    fn end_transit(&mut self) {
         self.under_way -= 1;
         if let Some(tally) = self.tally() {
             Tally::add(&tally.ended);
@@ -567,14 +567,14 @@ impl Lane {
         entry: &Entry,
         table: &mut AttemptTable,
     ) -> bool {
-        let delivery = &mut self.letters[index];
-        if delivery.progress.tried.is_empty() {
+        let open_letter = &mut self.letters[index];
+        if open_letter.progress.tried.is_empty() {
             let reason = match entry.is_unsupported() {
                 true => {
                     for location in &entry.locations {
                         let error =
                             TransportError::new(TransportErrorKind::Unsupported, location.kind());
-                        delivery.failed_at(location, error);
+                        open_letter.failed_at(location, error);
                     }
                     FailureReason::Unsupported
                 }
@@ -583,7 +583,7 @@ impl Lane {
             self.fail(now, index, reason, table);
             return true;
         }
-        delivery.progress.tried.clear();
+        open_letter.progress.tried.clear();
         if let Some(reason) = self.never_fits(now, index, table) {
             self.fail(now, index, reason, table);
             return true;
@@ -612,10 +612,10 @@ impl Lane {
         index: usize,
         table: &AttemptTable,
     ) -> Option<FailureReason> {
-        let delivery = &mut self.letters[index];
-        let reason = delivery.unfit()?;
-        let since = *delivery.progress.unfit_since.get_or_insert(now);
-        let attempts = &delivery.progress.attempts;
+        let open_letter = &mut self.letters[index];
+        let reason = open_letter.unfit()?;
+        let since = *open_letter.progress.unfit_since.get_or_insert(now);
+        let attempts = &open_letter.progress.attempts;
         let mut order = table.config.order_for(&self.receiver).iter();
         let is_legacy = |attempt: &Attempt| attempt.location.signature() != Signature::Frames;
         let waits = reason == FailureReason::TooLarge
@@ -635,9 +635,9 @@ impl Lane {
     /// Handles the end of the registration that the letter is for, after a refresh. Returns whether the lane may
     /// continue with the letter at this index: another one, or the same for the new registration.
     fn receiver_left(&mut self, now: Instant, index: usize, table: &mut AttemptTable) -> bool {
-        let delivery = &self.letters[index];
-        let registration = delivery.registration;
-        if !rules::may_move(delivery.progress.uncertain) {
+        let open_letter = &self.letters[index];
+        let registration = open_letter.registration;
+        if !rules::may_move(open_letter.progress.uncertain) {
             if self.may_return(now, index, table) {
                 return false;
             }
@@ -655,10 +655,10 @@ impl Lane {
         let successor = table.view.named(&self.receiver);
         let successor = successor.map(|entry| registration_of(&entry));
         if let Some(successor) = successor.filter(|successor| *successor != registration) {
-            let delivery = &mut self.letters[index];
-            delivery.registration = successor;
-            delivery.after = 0;
-            delivery.progress.tried.clear();
+            let open_letter = &mut self.letters[index];
+            open_letter.registration = successor;
+            open_letter.after = 0;
+            open_letter.progress.tried.clear();
             self.end_pause(PauseEnd::Registration);
             return true;
         }
@@ -701,11 +701,11 @@ impl Lane {
         self.returning = self.is_custody();
         work::steps(self.letters.len());
         let mut index = 0;
-        while let Some(delivery) = self.letters.get_mut(index) {
+        while let Some(open_letter) = self.letters.get_mut(index) {
             if !self.returning {
-                delivery.deadline = now;
+                open_letter.deadline = now;
             }
-            match &mut delivery.progress.state {
+            match &mut open_letter.progress.state {
                 State::UnderWay {
                     attempt,
                     location,
@@ -720,7 +720,7 @@ impl Lane {
                     index += 1;
                 }
                 State::Custody { .. } if self.returning => {
-                    delivery.ended(rules::AttemptEnd::Unknown);
+                    open_letter.ended(rules::AttemptEnd::Unknown);
                     self.return_letter(now, index, table);
                 }
                 State::Waiting(_) | State::Ended if self.returning => {
@@ -730,7 +730,7 @@ impl Lane {
                     self.fail(now, index, FailureReason::Unconfirmed, table);
                 }
                 State::Waiting(_) | State::Ended => {
-                    let reason = match delivery.reason_at_deadline(false) {
+                    let reason = match open_letter.reason_at_deadline(false) {
                         FailureReason::TimedOut => FailureReason::Closed,
                         reason => reason,
                     };
@@ -748,13 +748,13 @@ impl Lane {
         reason: FailureReason,
         table: &mut AttemptTable,
     ) {
-        let delivery = &mut self.letters[index];
-        let reason = match delivery.progress.uncertain {
+        let open_letter = &mut self.letters[index];
+        let reason = match open_letter.progress.uncertain {
             true => FailureReason::Unconfirmed,
             false => reason,
         };
-        let attempts = std::mem::take(&mut delivery.progress.attempts);
-        let sender = match &delivery.origin {
+        let attempts = std::mem::take(&mut open_letter.progress.attempts);
+        let sender = match &open_letter.origin {
             Origin::Local { .. } => Some(FailureTarget::Ours(self.sender)),
             Origin::LegacyPeer { from, failed } => {
                 let (from, failed) = (*from, failed.clone());
@@ -767,7 +767,7 @@ impl Lane {
             table.undelivered.push_back(Undelivered {
                 sender,
                 receiver: Arc::clone(&self.receiver),
-                letter: delivery.letter.clone(),
+                letter: open_letter.letter.clone(),
                 reason,
                 detail,
             });
@@ -796,10 +796,10 @@ impl Lane {
         settlement: Settlement,
         table: &mut AttemptTable,
     ) {
-        let Some(delivery) = self.letters.remove(index) else {
+        let Some(open_letter) = self.letters.remove(index) else {
             return;
         };
-        let len = delivery.letter.len();
+        let len = open_letter.letter.len();
         table.custody.release(&self.receiver, self.counted(len));
         self.bytes -= len;
         let is_last = self.letters.is_empty();
@@ -824,27 +824,27 @@ impl Lane {
         }
         match is_last {
             true => self.pause = None,
-            false => self.end_pause_behind(delivery.sequence),
+            false => self.end_pause_behind(open_letter.sequence),
         }
         match self.is_custody() {
             // A copy of a letter that was repeated may come although it was delivered.
-            true if !delivered || delivery.progress.hand_overs.pace().has_repeated() => {
-                self.left.push(now, &delivery, delivered);
+            true if !delivered || open_letter.progress.hand_overs.pace().has_repeated() => {
+                self.past_letters.push(now, &open_letter, delivered);
             }
             false if !delivered => self.send_predecessor(index, table),
             _ => {}
         }
-        let stream = self.stream_of(&delivery);
-        table.settle(delivery, stream, Arc::clone(&self.receiver), settlement);
+        let stream = self.stream_of(&open_letter);
+        table.settle(open_letter, stream, Arc::clone(&self.receiver), settlement);
     }
 
     /// Sends the custodian of the letter at `index` its new predecessor, after the letter before it
     /// failed at the sender's process. A gateway may hold a letter before it answers.
     fn send_predecessor(&mut self, index: usize, table: &mut AttemptTable) {
-        let Some(delivery) = self.letters.get(index) else {
+        let Some(open_letter) = self.letters.get(index) else {
             return;
         };
-        let (attempt, location) = match &delivery.progress.state {
+        let (attempt, location) = match &open_letter.progress.state {
             State::Custody {
                 attempt, location, ..
             } => (attempt, location),
@@ -854,9 +854,9 @@ impl Lane {
             _ => return,
         };
         let after = self.after(index);
-        if after < delivery.after {
-            let stream = self.stream_of(delivery);
-            let letter = (delivery.sequence, after, attempt.0);
+        if after < open_letter.after {
+            let stream = self.stream_of(open_letter);
+            let letter = (open_letter.sequence, after, attempt.0);
             table.predecessor(stream, Arc::clone(&self.receiver), letter, location.clone());
             self.letters[index].after = after;
         }
@@ -877,7 +877,7 @@ impl Lane {
 
     fn index(&self, sequence: u64) -> Option<usize> {
         self.letters
-            .binary_search_by_key(&sequence, |delivery| delivery.sequence)
+            .binary_search_by_key(&sequence, |open_letter| open_letter.sequence)
             .ok()
     }
 }

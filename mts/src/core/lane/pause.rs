@@ -55,23 +55,23 @@ impl Lane {
     ) {
         self.recovering = true;
         let after = self.after(index);
-        let delivery = &mut self.letters[index];
-        let (sequence, len) = (delivery.sequence, delivery.letter.len());
-        let hand_overs = &mut delivery.progress.hand_overs;
+        let open_letter = &mut self.letters[index];
+        let (sequence, len) = (open_letter.sequence, open_letter.letter.len());
+        let hand_overs = &mut open_letter.progress.hand_overs;
         let (turn, again, least) = hand_overs.came_back(now, cause, after, len);
         if let Some(from) = turn.begins_after(now) {
             self.due_at(from);
         }
-        let delivery = &mut self.letters[index];
-        delivery.progress.state = State::Waiting(turn);
+        let open_letter = &mut self.letters[index];
+        open_letter.progress.state = State::Waiting(turn);
         let ends_with = match cause {
             // The route has not failed.
             Cause::Returned | Cause::OutOfOrder { .. } => {
-                delivery.progress.tried.clear();
+                open_letter.progress.tried.clear();
                 PauseEnd::LowerPredecessor(sequence)
             }
             Cause::Busy => {
-                delivery.progress.tried.clear();
+                open_letter.progress.tried.clear();
                 PauseEnd::Credit
             }
             Cause::Moved | Cause::NoSuchAgent => PauseEnd::Registration,
@@ -131,8 +131,8 @@ impl Lane {
     }
 
     /// Ends the pause for a lower predecessor when the letter with this sequence has left the lane.
-    pub(super) fn end_pause_behind(&mut self, left: u64) {
-        let is_behind = |pause: &mut Pause| matches!(pause.ends_with, PauseEnd::LowerPredecessor(sequence) if left <= sequence);
+    pub(super) fn end_pause_behind(&mut self, settled: u64) {
+        let is_behind = |pause: &mut Pause| matches!(pause.ends_with, PauseEnd::LowerPredecessor(sequence) if settled <= sequence);
         self.pause.take_if(is_behind);
     }
 

@@ -48,13 +48,13 @@ impl Lane {
         let since = self.letters[index].since;
         let busy = self.busy || self.was_busy.is_some_and(|at| at >= since);
         let waits_behind = self.waits_behind();
-        let delivery = &mut self.letters[index];
-        if delivery.progress.attempts.is_empty() && !delivery.progress.busy && !busy {
-            delivery.progress.attempts.clone_from(&self.failed);
+        let open_letter = &mut self.letters[index];
+        if open_letter.progress.attempts.is_empty() && !open_letter.progress.busy && !busy {
+            open_letter.progress.attempts.clone_from(&self.failed);
         }
-        let reason = delivery.reason_at_deadline(busy);
+        let reason = open_letter.reason_at_deadline(busy);
         if reason == FailureReason::TimedOut {
-            delivery.progress.attempts.extend(waits_behind);
+            open_letter.progress.attempts.extend(waits_behind);
         }
         reason
     }

@@ -17,14 +17,14 @@ impl Lane {
     pub(crate) fn trust_changed(&mut self, now: Instant, table: &mut AttemptTable) {
         work::steps(self.letters.len());
         let mut index = 0;
-        while let Some(delivery) = self.letters.get(index) {
-            let entry = self.entry(delivery.registration, table);
+        while let Some(open_letter) = self.letters.get(index) {
+            let entry = self.entry(open_letter.registration, table);
             let entry = entry.filter(|entry| is_withdrawn(entry, table));
-            let (Some(entry), Some(delivery)) = (entry, self.letters.get_mut(index)) else {
+            let (Some(entry), Some(open_letter)) = (entry, self.letters.get_mut(index)) else {
                 index += 1;
                 continue;
             };
-            match &mut delivery.progress.state {
+            match &mut open_letter.progress.state {
                 // Its conclusion follows at once, and then it is refused like one that waits.
                 State::UnderWay {
                     attempt,
@@ -38,7 +38,7 @@ impl Lane {
                     index += 1;
                 }
                 State::Custody { .. } => {
-                    delivery.ended(AttemptEnd::Unknown);
+                    open_letter.ended(AttemptEnd::Unknown);
                     self.refuse(now, index, &entry, table);
                 }
                 State::Waiting(_) | State::Ended => self.refuse(now, index, &entry, table),

@@ -45,7 +45,7 @@ pub struct Passage {
     /// Sequence number of the letter among all letters of the sender.
     pub sequence: u64,
     /// Letters of one sender with the same number carry one message to several receivers.
-    pub send: Option<u64>,
+    pub submission: Option<u64>,
     /// Name of the receiver.
     pub receiver: Arc<str>,
     /// Its envelope, unless it is too long or malformed.
@@ -137,7 +137,7 @@ pub struct Joiner {
     waiting: BTreeMap<SendPosition, Key>,
     /// Letters that were reported, in order.
     reported: VecDeque<Key>,
-    early: HashMap<Key, (Outcome, bool)>,
+    outcomes_before_letters: HashMap<Key, (Outcome, bool)>,
     processes: HashMap<RecordSource, Process>,
     events: VecDeque<Event>,
     arrived: u64,
@@ -288,7 +288,7 @@ impl Joiner {
             at,
             stream: id.stream,
             sequence: id.sequence,
-            send: None,
+            submission: None,
             receiver: id.receiver,
             envelope,
             message,
@@ -301,7 +301,7 @@ impl Joiner {
             from_service: false,
             fate: Fate::UnderWay,
         };
-        if let Some((outcome, sender)) = self.early.remove(&key) {
+        if let Some((outcome, sender)) = self.outcomes_before_letters.remove(&key) {
             passage.settle(outcome, sender);
         }
         let known = KnownLetter {
@@ -318,11 +318,11 @@ impl Joiner {
     fn settled(&mut self, id: LetterId, outcome: Outcome, sender: bool) {
         let key = (id.stream.sender, id.sequence);
         let Some(known) = self.letters.get_mut(&key) else {
-            if self.early.len() >= MAX_EARLY {
+            if self.outcomes_before_letters.len() >= MAX_EARLY {
                 // Of letters whose first record was lost or precedes the watch.
-                self.early.clear();
+                self.outcomes_before_letters.clear();
             }
-            self.early.insert(key, (outcome, sender));
+            self.outcomes_before_letters.insert(key, (outcome, sender));
             return;
         };
         let (fate, seen_via) = (known.passage.fate.clone(), known.passage.via);
@@ -396,9 +396,9 @@ impl KnownLetter {
     fn see(&mut self, seen: Seen, gateway: Option<Arc<str>>) {
         let passage = &mut self.passage;
         match seen {
-            Seen::Sent(send) => {
-                passage.send = send;
-                passage.from_service = send.is_none();
+            Seen::Sent(submission) => {
+                passage.submission = submission;
+                passage.from_service = submission.is_none();
             }
             Seen::Taken(via) => {
                 passage.from_service |= via.is_none();
@@ -411,7 +411,7 @@ impl KnownLetter {
             }
             Seen::Passed(via, origin) => {
                 passage.gateway = gateway;
-                if origin == Origin::Elsewhere {
+                if origin == Origin::OtherHost {
                     passage.from_elsewhere = true;
                     passage.via = Some(via);
                 }

@@ -95,7 +95,7 @@ fn records_of_sender_and_receiver_are_one_letter() {
     assert_eq!(joiner.poll_timeout(), Some(now + HOLD));
     let passage = only(all(&mut joiner, now + HOLD));
     assert_eq!(
-        (passage.number, passage.send, passage.at),
+        (passage.number, passage.submission, passage.at),
         (1, Some(4), at(1))
     );
     assert_eq!(passage.fate, Fate::Settled(delivered(Kind::Shm)));
@@ -158,7 +158,7 @@ fn a_letter_through_the_gateway_has_the_transport_between_the_hosts() {
     joiner.handle(
         now,
         GATEWAY,
-        seen(2, id(7, 1), Seen::Passed(Kind::Shm, Origin::Here)),
+        seen(2, id(7, 1), Seen::Passed(Kind::Shm, Origin::ThisHost)),
     );
     joiner.handle(
         now,
@@ -173,7 +173,7 @@ fn a_letter_through_the_gateway_has_the_transport_between_the_hosts() {
     joiner.handle(
         now,
         GATEWAY,
-        seen(5, id(9, 1), Seen::Passed(Kind::Tcp, Origin::Elsewhere)),
+        seen(5, id(9, 1), Seen::Passed(Kind::Tcp, Origin::OtherHost)),
     );
     joiner.handle(now, B, seen(6, id(9, 1), Seen::Taken(Some(Kind::Shm))));
     joiner.handle(
@@ -230,7 +230,10 @@ fn memory_for_letters_without_an_outcome_is_bounded() {
     }
     assert_eq!(reported, MAX_REPORTED + 5000);
     assert!(joiner.waiting.len() <= MAX_WAITING && joiner.reported.len() <= MAX_REPORTED);
-    assert!(joiner.letters.len() <= MAX_WAITING + MAX_REPORTED && joiner.early.len() <= MAX_EARLY);
+    assert!(
+        joiner.letters.len() <= MAX_WAITING + MAX_REPORTED
+            && joiner.outcomes_before_letters.len() <= MAX_EARLY
+    );
 }
 
 /// Letters of several senders, with up to four records each that arrive late, in any order, twice
@@ -257,7 +260,7 @@ fn each_letter_is_reported_once_and_in_order() {
                 (B, seen(ms, letter(), Seen::Taken(Some(Kind::Shm)))),
                 (
                     GATEWAY,
-                    seen(ms, letter(), Seen::Passed(Kind::Shm, Origin::Here)),
+                    seen(ms, letter(), Seen::Passed(Kind::Shm, Origin::ThisHost)),
                 ),
                 (A, settled(ms, letter(), outcome.clone(), true)),
             ];

@@ -65,7 +65,7 @@ struct Header {
     sender: U64,
     receiver: U64,
     sequence: U64,
-    send: U64,
+    submission: U64,
     /// Nanoseconds since 1970.
     at: U64,
     lost: U64,
@@ -152,9 +152,9 @@ pub enum Seen {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
     /// This host.
-    Here,
+    ThisHost,
     /// Another host.
-    Elsewhere,
+    OtherHost,
 }
 
 /// Reported data of a letter.
@@ -275,8 +275,8 @@ pub fn of(notice: &Notice, request: Wish, at: SystemTime) -> Vec<u8> {
     header.receiver = U64::new(notice.stream.receiver.as_u64());
     header.sequence = U64::new(notice.sequence);
     let letter = match &notice.news {
-        News::Sent { send, letter } => {
-            header.send = U64::new(send.map_or(0, |send| send.0));
+        News::Sent { submission, letter } => {
+            header.submission = U64::new(submission.map_or(0, |submission| submission.0));
             letter
         }
         News::Taken { via, letter } => {
@@ -447,11 +447,11 @@ impl Header {
     fn place(&self) -> Result<Seen, RecordError> {
         let via = || wire::kind_of_code(self.via).ok_or(RecordError::Part("transport"));
         Ok(match self.kind {
-            SENT => Seen::Sent(Some(self.send.get()).filter(|send| *send != 0)),
+            SENT => Seen::Sent(Some(self.submission.get()).filter(|submission| *submission != 0)),
             TAKEN if self.via == NO_TRANSPORT => Seen::Taken(None),
             TAKEN => Seen::Taken(Some(via()?)),
-            _ if self.flags & REMOTE != 0 => Seen::Passed(via()?, Origin::Elsewhere),
-            _ => Seen::Passed(via()?, Origin::Here),
+            _ if self.flags & REMOTE != 0 => Seen::Passed(via()?, Origin::OtherHost),
+            _ => Seen::Passed(via()?, Origin::ThisHost),
         })
     }
 

@@ -42,7 +42,7 @@ fn all() -> Vec<News> {
     };
     vec![
         News::Sent {
-            send: Some(SubmissionId(9)),
+            submission: Some(SubmissionId(9)),
             letter: letter.clone(),
         },
         News::Taken {
@@ -83,7 +83,7 @@ fn records_survive_a_round_trip() {
                 let expected = match news {
                     News::Sent { .. } => Seen::Sent(Some(9)),
                     News::Taken { .. } => Seen::Taken(Some(Kind::Shm)),
-                    _ => Seen::Passed(Kind::Tcp, Origin::Elsewhere),
+                    _ => Seen::Passed(Kind::Tcp, Origin::OtherHost),
                 };
                 assert_eq!(place, expected);
                 let message = letter.message.unwrap();
@@ -111,11 +111,11 @@ fn records_survive_a_round_trip() {
 
 #[test]
 fn content_is_not_included_unless_requested() {
-    let News::Sent { send, .. } = all().remove(0) else {
+    let News::Sent { submission, .. } = all().remove(0) else {
         panic!("not the first");
     };
     let secret = News::Sent {
-        send,
+        submission,
         letter: letter("a secret of this robot"),
     };
     let bytes = written(secret, Wish::default());
@@ -173,7 +173,13 @@ fn long_parts_are_left_out_and_every_record_fits_a_datagram() {
         .unwrap();
     let letter = letter_for(&message, at()).unwrap();
     let request = Wish { content: u32::MAX };
-    let bytes = written(News::Sent { send: None, letter }, request);
+    let bytes = written(
+        News::Sent {
+            submission: None,
+            letter,
+        },
+        request,
+    );
     assert!(bytes.len() <= MAX_LEN);
     let RecordBody::Letter { letter, .. } = Record::parse(&bytes).unwrap().body else {
         panic!("not a letter");

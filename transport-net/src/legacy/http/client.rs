@@ -30,7 +30,7 @@ use super::socket::Socket;
 use super::tls::HandshakeError;
 use super::url::{PATH, Url};
 use crate::end;
-use crate::legacy::dialect::{Here, translate};
+use crate::legacy::dialect::{ReplyAddress, translate};
 use crate::legacy::queues::{LegacyDelivery, LegacySender, Progress};
 use crate::sockets::{self, prepare};
 use crate::stream::counters::count;
@@ -64,7 +64,7 @@ struct Connection {
     reader: ResponseReader,
     /// The address of this endpoint for the answers of the platform, if it listens where the
     /// platform can reach it.
-    here: Option<String>,
+    own_url: Option<String>,
     used: Instant,
 }
 
@@ -91,16 +91,21 @@ impl HttpSender {
         let signature = self.to.signature();
         let sink = endpoint.stream.sink();
         let has = |name: &str| sink.as_ref().is_some_and(|sink| sink.is_here(name));
-        let in_dialect = |here: Option<&str>| {
-            let here = here.map(|url| Here { url, has: &has });
-            translate(&delivery.letter, &delivery.receiver, &self.to, here)
-                .map_err(|error| not_sent(error.fault(), &error))
+        let in_dialect = |url: Option<&str>| {
+            let reply_address = url.map(|url| ReplyAddress { url, has: &has });
+            translate(
+                &delivery.letter,
+                &delivery.receiver,
+                &self.to,
+                reply_address,
+            )
+            .map_err(|error| not_sent(error.fault(), &error))
         };
-        let kept = match self.connection.take() {
+        let reusable = match self.connection.take() {
             Some(connection) => connection.usable().await,
             None => None,
         };
-        let mut connection = match kept {
+        let mut connection = match reusable {
             Some(connection) => connection,
             None => {
                 // No connection is opened for a letter that is not sent.
@@ -109,7 +114,7 @@ impl HttpSender {
                 opened.map_err(|error| self.not_opened(error))?
             }
         };
-        let [envelope, message] = in_dialect(connection.here.as_deref())?;
+        let [envelope, message] = in_dialect(connection.own_url.as_deref())?;
         let Some(boundary) = endpoint.boundary(&[&envelope, &message]) else {
             let detail = "no boundary is absent from the letter";
             return Err(not_sent(TransportErrorKind::Inexpressible, &detail));
@@ -177,7 +182,7 @@ impl HttpSender {
         Ok(Connection {
             stream,
             reader: ResponseReader::default(),
-            here: here(self.to.kind(), &endpoint.listening(), local),
+            own_url: own_url(self.to.kind(), &endpoint.listening(), local),
             used: Instant::now(),
         })
     }
@@ -325,7 +330,7 @@ impl Connection {
 }
 
 /// Returns the URL of this endpoint at the local address of a connection, if it listens there.
-fn here(scheme: Kind, listening: &[String], local: SocketAddr) -> Option<String> {
+fn own_url(scheme: Kind, listening: &[String], local: SocketAddr) -> Option<String> {
     let address = sockets::listening_at(listening, local)?;
     Some(format!("{scheme}://{address}{PATH}"))
 }

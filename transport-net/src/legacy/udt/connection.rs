@@ -76,7 +76,7 @@ pub(crate) struct Connection {
     role: Role,
     begun: Instant,
     /// Time of the last packet of the peer.
-    heard: Instant,
+    last_received: Instant,
     /// Time of the last packet to the peer, and their number since then.
     spoken: Instant,
     tries: u32,
@@ -132,7 +132,7 @@ impl Connection {
             path,
             role,
             begun: now,
-            heard: now,
+            last_received: now,
             spoken: now,
             tries: 0,
             busy: now,
@@ -246,7 +246,7 @@ impl Connection {
         }
         self.path = Some(path);
         self.peer_id = handshake.socket;
-        (self.heard, self.spoken, self.busy) = (now, now, now);
+        (self.last_received, self.spoken, self.busy) = (now, now, now);
         Ok(())
     }
 
@@ -257,7 +257,7 @@ impl Connection {
         now: Instant,
         counters: &mut UdtCounters,
     ) {
-        self.is_heard(now);
+        self.record_arrival(now);
         let Some(receiver) = self.receiver_mut() else {
             // Letters come over the peer's own connection.
             counters.ignored += 1;
@@ -284,7 +284,7 @@ impl Connection {
         now: Instant,
         counters: &mut UdtCounters,
     ) -> Result<(), ConnectionEnd> {
-        self.is_heard(now);
+        self.record_arrival(now);
         match (control, &mut self.role) {
             (Control::Shutdown, _) => return Err(ConnectionEnd::Hangup),
             (Control::Ack(ack), Role::Sending(sender)) => {
@@ -478,8 +478,8 @@ impl Connection {
         packet::control(&Control::Handshake(answer), 0, self.peer_id)
     }
 
-    fn is_heard(&mut self, now: Instant) {
-        self.heard = now;
+    fn record_arrival(&mut self, now: Instant) {
+        self.last_received = now;
         self.tries = 0;
     }
 
@@ -492,7 +492,7 @@ impl Connection {
     /// own only after a pause, gets the opportunity.
     fn keep_alive_at(&self) -> Instant {
         let after = KEEP_ALIVE * self.tries.saturating_add(1).min(10);
-        self.heard.max(self.spoken) + after
+        self.last_received.max(self.spoken) + after
     }
 
     /// Returns the time at which the peer counts as silent.
@@ -501,7 +501,7 @@ impl Connection {
             Role::Receiving(_) => self.limits.idle_close,
             _ => self.limits.silence,
         };
-        let silent = self.heard + timeout;
+        let silent = self.last_received + timeout;
         match self.tries >= MIN_TRIES {
             true => silent,
             // At least one more keep-alive.

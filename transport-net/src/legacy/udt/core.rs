@@ -325,7 +325,7 @@ impl Core {
         };
         if let (0, Packet::Control(Control::Handshake(handshake)), true) = (to, &packet, listening)
         {
-            return self.greet(now, path, handshake);
+            return self.handle_request(now, path, handshake);
         }
         let number = self.sockets.get(&to).copied();
         let entry = number.and_then(|number| Some((number, self.connections.get_mut(number)?)));
@@ -439,7 +439,7 @@ impl Core {
     }
 
     /// Handles the handshake of a peer that opens a connection.
-    fn greet(&mut self, now: Instant, path: Path, handshake: &Handshake) {
+    fn handle_request(&mut self, now: Instant, path: Path, handshake: &Handshake) {
         let from = path.remote;
         if !(self.access)(from.ip()) {
             log_limit::warn!(

@@ -82,13 +82,13 @@ impl RateControl {
 
     /// Notes the rates that the receiver has measured, in packets per second; 0 if unknown.
     pub(crate) fn measured(&mut self, arrivals: u32, capacity: u32) {
-        for (kept, new) in [
+        for (average, new) in [
             (&mut self.arrivals, arrivals),
             (&mut self.capacity, capacity),
         ] {
             if new > 0 {
                 let new = f64::from(new);
-                *kept = Some(kept.map_or(new, |kept| (kept * 7.0 + new) / 8.0));
+                *average = Some(average.map_or(new, |average| (average * 7.0 + new) / 8.0));
             }
         }
     }
@@ -171,17 +171,17 @@ impl RateControl {
         let Some(capacity) = self.capacity else {
             return MIN_INCREASE;
         };
-        let mut left = match self.period {
+        let mut spare = match self.period {
             period if period > 0.0 => capacity - 1e6 / period,
             _ => 0.0,
         };
-        if self.period > self.period_before && left > capacity / 9.0 {
-            left = capacity / 9.0;
+        if self.period > self.period_before && spare > capacity / 9.0 {
+            spare = capacity / 9.0;
         }
-        if left <= 0.0 {
+        if spare <= 0.0 {
             return MIN_INCREASE;
         }
-        let magnitude = (left * self.packet * 8.0).log10().ceil();
+        let magnitude = (spare * self.packet * 8.0).log10().ceil();
         let increase = 10_f64.powf(magnitude) * 0.000_001_5 / self.packet;
         increase.max(MIN_INCREASE)
     }

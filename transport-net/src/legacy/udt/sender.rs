@@ -456,13 +456,13 @@ impl Sender {
         };
         packet::put_data(out, &data, time, to);
         let packets = usize::try_from(sequence - begun.first).unwrap_or(usize::MAX);
-        let (mut skip, mut left) = (packets.saturating_mul(self.payload), self.payload);
+        let (mut skip, mut remaining) = (packets.saturating_mul(self.payload), self.payload);
         for piece in &begun.outgoing.pieces {
             let part = piece.get(skip..).unwrap_or_default();
-            let part = part.get(..left).unwrap_or(part);
+            let part = part.get(..remaining).unwrap_or(part);
             out.extend_from_slice(part);
             skip = skip.saturating_sub(piece.len());
-            left -= part.len();
+            remaining -= part.len();
         }
         true
     }
@@ -651,9 +651,9 @@ mod tests {
         sender.send(AttemptId(1), letter(14_560)).unwrap();
         assert_eq!(sent(&mut sender, now).len(), 10);
         sender.handle_ack(&ack(1, first + 3, 8192), now).unwrap();
-        let early = now + Duration::from_millis(5);
-        sender.handle_ack(&ack(2, first + 4, 8192), early).unwrap();
-        assert_eq!(sent(&mut sender, early).len(), 0, "it may be under way");
+        let soon = now + Duration::from_millis(5);
+        sender.handle_ack(&ack(2, first + 4, 8192), soon).unwrap();
+        assert_eq!(sent(&mut sender, soon).len(), 0, "it may be under way");
         let late = now + Duration::from_millis(100);
         sender.handle_ack(&ack(3, first + 5, 8192), late).unwrap();
         assert_eq!(sent(&mut sender, late).len(), 5);

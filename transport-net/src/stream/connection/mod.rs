@@ -551,7 +551,7 @@ impl Connection {
             return Ok(());
         }
         match (frame, self.peer.is_some()) {
-            (Frame::Hello(hello), false) => self.greet(hello, now),
+            (Frame::Hello(hello), false) => self.handle_hello(hello, now),
             (Frame::Goodbye { last }, _) => Err(ConnectionEnd::Goodbye { last }),
             (_, false) => Err(ConnectionEnd::ProtocolViolation(
                 "a frame before the hello".into(),
@@ -800,7 +800,7 @@ impl Connection {
         (!is_its).then(|| not_its_agent(&sent.receiver))
     }
 
-    fn greet(&mut self, hello: Hello, now: Instant) -> Result<(), ConnectionEnd> {
+    fn handle_hello(&mut self, hello: Hello, now: Instant) -> Result<(), ConnectionEnd> {
         let found = hello.identity.incarnation;
         if found == self.hello.identity.incarnation {
             // This side would send letters and its directory to itself. The hello shows the dialing side

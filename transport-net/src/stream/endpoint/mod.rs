@@ -488,7 +488,7 @@ impl Endpoint {
     /// the connections of local addresses that no longer exist, on which no byte can arrive.
     #[cfg(feature = "ip")]
     fn interfaces_changed(&self) {
-        let (sink, told, lost, links) = {
+        let (sink, locations, lost, links) = {
             let mut registry = self.registry.lock();
             let Reached::Addresses(listening) = &mut registry.listening else {
                 return;
@@ -501,14 +501,14 @@ impl Endpoint {
                 }
             };
             let incarnation = self.config.identity.incarnation;
-            let told = moved
+            let locations = moved
                 .relocated
                 .then(|| listening.locations(self.kind, incarnation));
             let links: Vec<_> = match moved.lost.is_empty() {
                 true => Vec::new(),
                 false => registry.links.values().cloned().collect(),
             };
-            (registry.sink.clone(), told, moved.lost, links)
+            (registry.sink.clone(), locations, moved.lost, links)
         };
         for link in links {
             if let Some(ip) = link.local_ip()
@@ -520,7 +520,7 @@ impl Endpoint {
                 self.forget(&link);
             }
         }
-        match (sink, told) {
+        match (sink, locations) {
             (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
             (_, Some(Err(error))) => {
                 log_limit::warn!(kind = %self.kind, %error, "cannot refresh the locations; keeping the previous ones");
@@ -735,7 +735,7 @@ impl Endpoint {
         let links: Vec<_> = links.collect();
         drop(registry);
         for link in links {
-            link.left();
+            link.peer_moved();
         }
     }
 
@@ -943,7 +943,7 @@ impl Endpoint {
     }
 
     /// Logs the end of a connection and removes the connection from every table.
-    pub(crate) fn left(&self, link: &Arc<Link>, end: &ConnectionEnd) {
+    pub(crate) fn connection_ended(&self, link: &Arc<Link>, end: &ConnectionEnd) {
         if end.is_misbehavior() {
             count(&self.tally.refused_nonsense);
             let key = self.registry.lock().quota_keys.get(&link.number).cloned();

@@ -155,8 +155,8 @@ async fn unproved_connections_of_one_source_evict_each_other() {
     let has =
         |(place, _): &(UnprovedSlot, JoinHandle<()>)| registry.unproved.contains_key(&place.number);
     assert!(has(&slow));
-    let left = [&crowd, &networks].map(|crowd| crowd.iter().filter(|it| has(it)).count());
-    assert_eq!(1 + left[0] + left[1], limits.max_strangers);
+    let remaining = [&crowd, &networks].map(|crowd| crowd.iter().filter(|it| has(it)).count());
+    assert_eq!(1 + remaining[0] + remaining[1], limits.max_strangers);
     drop(registry);
 }
 
@@ -180,7 +180,7 @@ const Y: &str = "tcp://10.0.0.2:7788";
 
 /// Stands for the task of a link, because the tests have no sockets: ends the link on request.
 async fn ends_when_asked_to(link: Arc<Link>) {
-    let end = link.leaving().await;
+    let end = link.end_requested().await;
     assert_eq!(end, ConnectionEnd::Superseded);
     link.is_over();
 }
@@ -549,8 +549,8 @@ async fn letters_take_another_connection_after_their_peer_has_announced_another_
     let dialed = dials(&endpoint, &to).await;
     let elsewhere = comes(None, 7, "10.0.0.9:1", 1, Y);
     let (elsewhere, _) = enters(&endpoint, elsewhere).await.unwrap();
-    let came = comes(None, 8, "10.0.0.7:1", 1, X);
-    let (other_peer, _) = enters(&endpoint, came).await.unwrap();
+    let hello = comes(None, 8, "10.0.0.7:1", 1, X);
+    let (other_peer, _) = enters(&endpoint, hello).await.unwrap();
     endpoint.service_left(&to);
     assert!(dialed.is_suspect());
     assert!(!elsewhere.is_suspect());

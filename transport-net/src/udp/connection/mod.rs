@@ -95,7 +95,7 @@ pub(crate) struct Connection {
     /// Delivered parcels that are not answered yet.
     arrivals: HashSet<u64>,
     /// The last parcel that was polled for the sink.
-    told: u64,
+    last_polled: u64,
     /// The rate limit of the peer, if it has one. No parcels are accepted before `paused_until`.
     pub(super) rate_limit: Option<Arc<PeerRateLimit>>,
     paused_until: Option<Instant>,
@@ -103,11 +103,11 @@ pub(crate) struct Connection {
     recovery: Recovery,
     mtu: Mtu,
     events: VecDeque<Event>,
-    heard: Option<Instant>,
+    last_received: Option<Instant>,
     /// Time since which the connection is in doubt; see [`Connection::doubt`].
     doubted: Option<Instant>,
     /// Whether it is in doubt because the peer has announced that it is elsewhere.
-    left: bool,
+    peer_moved: bool,
     /// The last location for which the connection was used and confirmed or put in doubt.
     leads_to: Option<Location>,
     spoken: Instant,
@@ -201,16 +201,16 @@ impl Connection {
             held_bytes: 0,
             meter: None,
             arrivals: HashSet::new(),
-            told: 0,
+            last_polled: 0,
             rate_limit: None,
             paused_until: None,
             received: Received::default(),
             recovery: Recovery::new(now),
             mtu: Mtu::new(limits.max_datagram),
             events: VecDeque::new(),
-            heard: None,
+            last_received: None,
             doubted: None,
-            left: false,
+            peer_moved: false,
             leads_to: None,
             spoken: now,
             busy: now,
@@ -349,7 +349,7 @@ impl Connection {
         if let Some(sample) = dialing.round_trip(path, now) {
             self.recovery.measured(sample);
         }
-        self.heard = Some(now);
+        self.last_received = Some(now);
         self.busy = now;
         let (expected, found) = (self.expected, peer.identity.incarnation);
         if expected.is_known() && expected != found {
@@ -368,8 +368,8 @@ impl Connection {
     /// timeout than usual. Does nothing when a packet arrived within `quiet`. Returns whether the
     /// connection is in doubt.
     pub(crate) fn doubt(&mut self, now: Instant, quiet: Duration) -> bool {
-        let heard = self.heard.is_some_and(|heard| now < heard + quiet);
-        if self.peer.is_none() || heard {
+        let is_recent = self.last_received.is_some_and(|at| now < at + quiet);
+        if self.peer.is_none() || is_recent {
             return false;
         }
         if self.doubted.is_none() {
@@ -380,8 +380,8 @@ impl Connection {
     }
 
     /// Puts the connection in doubt because the peer has announced that it is elsewhere.
-    pub(crate) fn left(&mut self, now: Instant) {
-        self.left = self.doubt(now, Duration::ZERO);
+    pub(crate) fn peer_moved(&mut self, now: Instant) {
+        self.peer_moved = self.doubt(now, Duration::ZERO);
     }
 
     /// Sends a ping to the peer.
@@ -389,7 +389,7 @@ impl Connection {
         if !self
             .urgent
             .iter()
-            .any(|kept| matches!(kept, SentContent::Ping))
+            .any(|content| matches!(content, SentContent::Ping))
         {
             self.urgent.push_back(SentContent::Ping);
         }
@@ -397,7 +397,7 @@ impl Connection {
 
     /// Whether a packet arrived after this time.
     pub(crate) fn received_since(&self, since: Instant) -> bool {
-        self.heard.is_some_and(|heard| heard > since)
+        self.last_received.is_some_and(|at| at > since)
     }
 
     /// Notes that the connection is used for a location for which it was not opened. When the peer
@@ -416,7 +416,7 @@ impl Connection {
     /// Returns the time that a peer in doubt has to respond.
     fn doubt_timeout(&self) -> Duration {
         let timeout = self.limits.silence / 4;
-        match self.left {
+        match self.peer_moved {
             true => timeout.min(LEFT_TIMEOUT),
             false => timeout,
         }
@@ -439,8 +439,8 @@ impl Connection {
             )));
         }
         self.mtu.too_big(size);
-        let kept = self.recovery.withdraw();
-        kept.into_iter().for_each(|kept| self.lost(kept));
+        let contents = self.recovery.withdraw();
+        contents.into_iter().for_each(|content| self.lost(content));
         Ok(())
     }
 
@@ -452,7 +452,7 @@ impl Connection {
     pub(crate) fn poll_event(&mut self) -> Option<Event> {
         let event = self.events.pop_front()?;
         if let Event::Arrived { id, .. } = event {
-            self.told = id;
+            self.last_polled = id;
         }
         Some(event)
     }
@@ -484,7 +484,7 @@ impl Connection {
             }
         }
         let empty = out.len() == DATA_LEN;
-        let mut kept = Vec::new();
+        let mut contents = Vec::new();
         while let Some(next) = self.urgent.front() {
             if out.len() + self.frame_len(*next) > mtu {
                 break;
@@ -492,31 +492,31 @@ impl Connection {
             let next = *next;
             self.urgent.pop_front();
             if self.put_small(&mut out, next) {
-                kept.push(next);
+                contents.push(next);
             }
         }
         if let Some((fresh, size)) = parcel
             && out.len() + size - DATA_LEN <= mtu
             && self.recovery.has_room(out.len() + size - DATA_LEN)
         {
-            kept.extend(self.put_next_parcel(&mut out, fresh, now, counters));
-        } else if kept.is_empty()
+            contents.extend(self.put_next_parcel(&mut out, fresh, now, counters));
+        } else if contents.is_empty()
             && self.wants_probe()
             && let Some(size) = self.mtu.take_probe()
         {
             packet::put_ping(&mut out);
             out.resize(size, 0);
-            kept.push(SentContent::Probe(size));
+            contents.push(SentContent::Probe(size));
         }
-        if kept.is_empty() && empty {
+        if contents.is_empty() && empty {
             return None;
         }
         let number = self.recovery.take_number();
         if let Some(place) = out.get_mut(DATA_LEN - 8..DATA_LEN) {
             place.copy_from_slice(&number.to_le_bytes());
         }
-        if !kept.is_empty() {
-            self.recovery.sent(number, now, out.len(), kept);
+        if !contents.is_empty() {
+            self.recovery.sent(number, now, out.len(), contents);
             self.spoken = now;
         }
         Some((path, out))
@@ -568,7 +568,7 @@ impl Connection {
         }
         if self.recovery.timeout_at().is_some_and(|due| now >= due) {
             let lost = self.recovery.timed_out();
-            lost.into_iter().for_each(|kept| self.lost(kept));
+            lost.into_iter().for_each(|content| self.lost(content));
             if !self.recovery.is_waiting() && self.resend.is_empty() && self.urgent.is_empty() {
                 // The lost packets had no contents that are still needed.
                 self.recovery.reset_backoff();
@@ -624,7 +624,7 @@ impl Connection {
         let goodbye = self.path.filter(|_| !speechless).map(|path| {
             let mut out = Vec::new();
             packet::put_data(&mut out, self.peer_id, self.recovery.take_number());
-            packet::put_goodbye(&mut out, self.told);
+            packet::put_goodbye(&mut out, self.last_polled);
             (path, out)
         });
         (concluded, goodbye)
@@ -633,8 +633,8 @@ impl Connection {
     /// Returns the time at which a peer that owes answers gets a ping.
     fn ping_due(&self) -> Option<Instant> {
         let owed = !self.sent.is_empty() && !self.recovery.is_waiting() && self.urgent.is_empty();
-        let heard = self.heard.unwrap_or(self.spoken);
-        owed.then(|| heard.max(self.spoken) + self.limits.silence / 4)
+        let last_received = self.last_received.unwrap_or(self.spoken);
+        owed.then(|| last_received.max(self.spoken) + self.limits.silence / 4)
     }
 
     fn idle_due(&self) -> Option<Instant> {
@@ -642,7 +642,7 @@ impl Connection {
             && self.waiting.is_empty()
             && self.arrivals.is_empty()
             && self.answers.is_empty();
-        let timeout = match self.heard {
+        let timeout = match self.last_received {
             Some(_) => self.limits.idle_close,
             // The connection was opened but never used.
             None => self.limits.connect_timeout.min(self.limits.idle_close),

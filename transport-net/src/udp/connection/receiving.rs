@@ -27,8 +27,8 @@ impl Connection {
             // The welcome is late or lost; the peer retransmits these frames.
             return Ok(());
         }
-        self.heard = Some(now);
-        (self.doubted, self.left) = (None, false);
+        self.last_received = Some(now);
+        (self.doubted, self.peer_moved) = (None, false);
         if !self.received.is_new(number) {
             counters.duplicates += 1;
             self.received.wants_ack(now, true);
@@ -43,12 +43,18 @@ impl Connection {
             };
             match frame {
                 Frame::Ack(ack) => {
-                    let Some(told) = self.recovery.acknowledged(&ack, now) else {
+                    let Some(result) = self.recovery.acknowledged(&ack, now) else {
                         let what = "an acknowledgment of a packet that was not sent";
                         return Err(ConnectionEnd::ProtocolViolation(what.into()));
                     };
-                    told.arrived.into_iter().for_each(|kept| self.arrived(kept));
-                    told.lost.into_iter().for_each(|kept| self.lost(kept));
+                    result
+                        .arrived
+                        .into_iter()
+                        .for_each(|content| self.arrived(content));
+                    result
+                        .lost
+                        .into_iter()
+                        .for_each(|content| self.lost(content));
                 }
                 Frame::Ping => (elicits, at_once) = (true, true),
                 Frame::Answer { id, answer } => {

@@ -14,8 +14,8 @@ use super::{Connection, Event, LOSSES_OF_LARGE, Sent, too_large};
 
 impl Connection {
     /// Handles the acknowledgment of content.
-    pub(super) fn arrived(&mut self, kept: SentContent) {
-        match kept {
+    pub(super) fn arrived(&mut self, content: SentContent) {
+        match content {
             SentContent::Parcel(id) => {
                 self.resend.remove(&id);
                 if let Some(sent) = self.sent.get_mut(&id) {
@@ -34,8 +34,8 @@ impl Connection {
     }
 
     /// Handles the loss of content.
-    pub(super) fn lost(&mut self, kept: SentContent) {
-        match kept {
+    pub(super) fn lost(&mut self, content: SentContent) {
+        match content {
             SentContent::Parcel(id) => {
                 let Some(sent) = self.sent.get_mut(&id) else {
                     return;
@@ -51,11 +51,13 @@ impl Connection {
                 self.resend.insert(id);
             }
             SentContent::Answer(id) if self.answers.contains_key(&id) => {
-                self.urgent.push_front(kept)
+                self.urgent.push_front(content)
             }
-            SentContent::Skipped(id) if self.sent.contains_key(&id) => self.urgent.push_front(kept),
+            SentContent::Skipped(id) if self.sent.contains_key(&id) => {
+                self.urgent.push_front(content)
+            }
             SentContent::Answer(_) | SentContent::Skipped(_) => {}
-            SentContent::Ping => self.urgent.push_front(kept),
+            SentContent::Ping => self.urgent.push_front(content),
             SentContent::Probe(size) => self.mtu.lost(size),
         }
     }

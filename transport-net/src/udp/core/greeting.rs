@@ -34,7 +34,7 @@ enum ClaimStatus {
 
 impl Core {
     /// Handles the hello of an unproved peer.
-    pub(super) fn greet(
+    pub(super) fn handle_hello(
         &mut self,
         now: Instant,
         path: Path,

@@ -51,7 +51,7 @@ pub(crate) enum CoreEvent {
     /// A peer has introduced itself.
     Introduced(Introduction),
     /// The connection of an introduced peer has ended.
-    Parted(Introduction),
+    Disconnected(Introduction),
 }
 
 pub(crate) struct Core {
@@ -216,7 +216,7 @@ impl Core {
     }
 
     /// Puts the connections with this location in doubt, because the service has announced that it is elsewhere.
-    pub(crate) fn left(&mut self, now: Instant, location: &Location) {
+    pub(crate) fn location_vacated(&mut self, now: Instant, location: &Location) {
         let home = address::numeric(location.authority()).ok();
         let home = home.map(|address| address.ip());
         let known = self.known.get(&location.incarnation());
@@ -224,7 +224,7 @@ impl Core {
             self.with(number, |connection, _| {
                 let path = connection.path().map(|path| path.remote.ip());
                 if path.is_some() && path == home {
-                    connection.left(now);
+                    connection.peer_moved(now);
                 }
                 Ok(())
             });
@@ -255,7 +255,7 @@ impl Core {
     /// Ends an attempt to this location.
     pub(crate) fn abandon(&mut self, attempt: AttemptId, to: &Location) -> Abandoned {
         self.notes
-            .retain(|told| !matches!(told, CoreEvent::Concluded(other, _) if *other == attempt));
+            .retain(|event| !matches!(event, CoreEvent::Concluded(other, _) if *other == attempt));
         let dialed = self.dialed.get(to).into_iter();
         let known = self.known.get(&to.incarnation()).into_iter().flatten();
         for number in dialed.chain(known) {
@@ -297,7 +297,7 @@ impl Core {
                 initiator,
                 cookie,
                 hello,
-            } if listening => self.greet(now, path, initiator, &cookie, hello),
+            } if listening => self.handle_hello(now, path, initiator, &cookie, hello),
             Datagram::Cookie { to, cookie } => {
                 self.of_dialing(to, path, |_, connection| {
                     if let Some(dialing) = connection.dialing_mut() {
@@ -379,8 +379,8 @@ impl Core {
     }
 
     pub(crate) fn poll_event(&mut self) -> Option<CoreEvent> {
-        if let Some(told) = self.notes.pop_front() {
-            return Some(told);
+        if let Some(event) = self.notes.pop_front() {
+            return Some(event);
         }
         self.connections.poll_eventful(|number, entry| {
             match (entry.connection.poll_event()?, &entry.peer) {
@@ -477,7 +477,7 @@ impl Core {
         let concluded = concluded.into_iter();
         self.notes
             .extend(concluded.map(|(attempt, what)| CoreEvent::Concluded(attempt, what)));
-        self.notes.extend(entry.peer.map(CoreEvent::Parted));
+        self.notes.extend(entry.peer.map(CoreEvent::Disconnected));
         // Bounded by the number of connections.
         self.outbox.extend(goodbye);
     }
@@ -523,11 +523,11 @@ impl Core {
     /// connections of the service that it claims to be.
     fn doubt_others(&mut self, now: Instant, number: u32, incarnation: Incarnation) {
         let remote = |entry: &Entry| Some(entry.connection.path()?.remote.ip());
-        let here = self.connections.get(number).and_then(remote);
+        let address = self.connections.get(number).and_then(remote);
         let others = self.known.get(&incarnation).cloned().unwrap_or_default();
         for other in others {
             if let Some(entry) = self.connections.get_mut(other)
-                && remote(entry) != here
+                && remote(entry) != address
             {
                 entry.connection.doubt(now, Duration::ZERO);
                 self.connections.touch(other);

@@ -65,7 +65,7 @@ pub(crate) fn read_object<T>(text: &[u8], read: impl FnOnce(&Term<'_>) -> Option
 /// A description in a directory facilitator or an agent management system.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
-pub struct KeptDescription {
+pub struct StoredDescription {
     /// The name of the agent.
     pub name: Arc<str>,
     /// The registration of the agent: see [`Asker::registration`].
@@ -73,34 +73,35 @@ pub struct KeptDescription {
     /// The platform of the agent.
     pub platform: Platform,
     /// The rest of the lease in milliseconds, if there is one.
-    pub left: Option<u64>,
+    #[serde(rename = "left")]
+    pub lease_left: Option<u64>,
     /// The description in FIPA-SL.
     pub(crate) text: Text,
 }
 
-impl KeptDescription {
+impl StoredDescription {
     /// Returns the end of the lease, `elapsed` after the description was kept.
     pub(crate) fn ends(&self, now: Instant, elapsed: Duration) -> Option<Instant> {
-        let left = self.left.map(Duration::from_millis);
-        let left = match self.platform {
-            Platform::Host => left?,
-            _ => left.unwrap_or(limits::LEASE).min(limits::LEASE),
+        let lease_left = self.lease_left.map(Duration::from_millis);
+        let lease_left = match self.platform {
+            Platform::Host => lease_left?,
+            _ => lease_left.unwrap_or(limits::LEASE).min(limits::LEASE),
         };
         // A lease beyond the range of the clock does not end.
-        now.checked_add(left.saturating_sub(elapsed))
+        now.checked_add(lease_left.saturating_sub(elapsed))
     }
 }
 
 /// Returns the rest of a lease.
-pub(crate) fn left(now: Instant, ends: Option<Instant>) -> Option<u64> {
-    let left = ends?.saturating_duration_since(now).as_millis();
-    Some(u64::try_from(left).unwrap_or(u64::MAX))
+pub(crate) fn lease_left(now: Instant, ends: Option<Instant>) -> Option<u64> {
+    let lease_left = ends?.saturating_duration_since(now).as_millis();
+    Some(u64::try_from(lease_left).unwrap_or(u64::MAX))
 }
 
 /// A subscription of an agent without a registration to a directory facilitator.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
-pub struct KeptSubscription {
+pub struct StoredSubscription {
     /// The name of the subscriber.
     pub name: Arc<str>,
     /// The platform of the subscriber.
@@ -114,7 +115,7 @@ pub struct KeptSubscription {
     pub(crate) changed: Option<Vec<Arc<str>>>,
 }
 
-impl KeptSubscription {
+impl StoredSubscription {
     /// Keeps a subscription: the message that made it, and its query.
     pub(crate) fn new(asker: &Asker, message: MessageBuilder, query: &[u8]) -> Option<Self> {
         let content = [b"(", query, b")"].concat();
