@@ -60,7 +60,8 @@ impl Access {
     #[must_use]
     pub fn passes(
         &self,
-        (sender, receiver): (&str, &str),
+        sender: &str,
+        receiver: &str,
         performative: &str,
         protocol: Option<&str>,
     ) -> bool {

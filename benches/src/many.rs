@@ -64,7 +64,7 @@ pub(super) async fn measure(stage: &mut Stage, effort: &Effort) -> Result<Many, 
     let mut rounds: [Vec<f64>; 4] = Default::default();
     for _ in 0..effort.rounds {
         for ((what, size), medians) in all.iter().zip(&mut rounds) {
-            medians.push(turn(stage, (sender, receiver), *what, *size).await?);
+            medians.push(turn(stage, Ends { sender, receiver }, *what, *size).await?);
         }
     }
     let [fill, small, together, copies] = &rounds;
@@ -88,13 +88,16 @@ pub(super) async fn measure(stage: &mut Stage, effort: &Effort) -> Result<Many, 
     })
 }
 
+/// The two processes of a turn.
+#[derive(Debug, Clone, Copy)]
+struct Ends {
+    sender: ProcessIndex,
+    receiver: ProcessIndex,
+}
+
 /// The median of one turn, in nanoseconds.
-async fn turn(
-    stage: &mut Stage,
-    (sender, receiver): (ProcessIndex, ProcessIndex),
-    what: Spread,
-    size: usize,
-) -> Result<f64, String> {
+async fn turn(stage: &mut Stage, ends: Ends, what: Spread, size: usize) -> Result<f64, String> {
+    let Ends { sender, receiver } = ends;
     let letters = Letters {
         count: TIMES + WARMING,
         size,

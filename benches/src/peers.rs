@@ -115,7 +115,7 @@ impl Peers {
             }
             if let Some(asker) = self.asker.as_ref().filter(|_| count > 0) {
                 introduce(agent, gateway, asker).await?;
-                ours.order(asker, &self.echo, (count, self.size), &mut theirs)
+                ours.order(asker, &self.echo, count, self.size, &mut theirs)
                     .await?;
             }
             step(&format!("turn {} of {TURNS}", turn + 1));
@@ -210,7 +210,8 @@ impl<'a> Side<'a> {
         &mut self,
         asker: &AgentId,
         echo: &AgentId,
-        (count, size): (usize, usize),
+        count: usize,
+        size: usize,
         found: &mut Conversations,
     ) -> Result<(), BenchError> {
         let address = echo.addresses().first().map_or("", |address| address);

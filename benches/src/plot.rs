@@ -1,6 +1,7 @@
 //! A diagram of latency over size, both logarithmic, as an SVG document.
 
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 
 use plotters::coord::ranged1d::{KeyPointHint, Ranged};
 use plotters::prelude::*;
@@ -192,11 +193,12 @@ fn heights<DB: DrawingBackend>(
 }
 
 /// Minimum and maximum.
-fn span(lines: &[Line], of: impl Fn(&(f64, f64)) -> f64) -> (f64, f64) {
+fn span(lines: &[Line], of: impl Fn(&(f64, f64)) -> f64) -> RangeInclusive<f64> {
     let values = lines.iter().flat_map(|line| line.points.iter().map(&of));
-    values.fold((f64::INFINITY, 0.0), |(least, most), value| {
+    let (least, most) = values.fold((f64::INFINITY, 0.0_f64), |(least, most), value| {
         (least.min(value), most.max(value))
-    })
+    });
+    least..=most
 }
 
 /// Formats a time in microseconds.
@@ -221,21 +223,19 @@ struct Decades {
 }
 
 impl Decades {
-    fn sizes((least, most): (f64, f64)) -> Self {
+    fn sizes(sizes: RangeInclusive<f64>) -> Self {
         let common = [100.0, 1024.0, 65_536.0, 1_048_576.0, 4_194_304.0];
-        let marks = common
-            .into_iter()
-            .filter(|mark| (least..=most).contains(mark));
+        let marks = common.into_iter().filter(|mark| sizes.contains(mark));
         Self {
-            from: least / 1.3,
-            until: most * 1.1,
+            from: sizes.start() / 1.3,
+            until: sizes.end() * 1.1,
             marks: marks.collect(),
         }
     }
 
-    fn times((least, most): (f64, f64)) -> Self {
-        let from = least.log10().floor() as i32;
-        let until = most.log10().ceil() as i32;
+    fn times(times: RangeInclusive<f64>) -> Self {
+        let from = times.start().log10().floor() as i32;
+        let until = times.end().log10().ceil() as i32;
         Self {
             from: 10f64.powi(from),
             until: 10f64.powi(until.max(from + 1)),

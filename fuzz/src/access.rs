@@ -25,12 +25,11 @@ pub fn play(bytes: &[u8]) {
         let (sender, receiver) = (name(&mut input), name(&mut input));
         let performative = input.one_of(&["inform", "request", "cfp", ""]);
         let protocol = input.one_of(&[None, Some("fipa-request"), Some("")]);
-        let between = (sender, receiver);
-        let passes = access.passes(between, performative, protocol);
+        let passes = access.passes(sender, receiver, performative, protocol);
         // The allow rules are tried as deny rules, which shows the letters that they match.
         let named = |rules: &Option<Access>| {
             let rules = rules.as_ref();
-            rules.is_some_and(|it| !it.passes(between, performative, protocol))
+            rules.is_some_and(|it| !it.passes(sender, receiver, performative, protocol))
         };
         let expected =
             !named(&denies) && (allow.iter().all(|it| it.1.is_empty()) || named(&allows));

@@ -51,7 +51,7 @@ impl Writer<'_> {
             Peer::Jade => self.as_jade(message)?,
         }
         for (name, value) in &message.user_defined {
-            self.user_defined(code::message::USER_DEFINED, (name, value))?;
+            self.user_defined(code::message::USER_DEFINED, name, value)?;
         }
         if let Some(content) = &message.content {
             self.out.byte(code::message::CONTENT);
@@ -174,7 +174,7 @@ impl Writer<'_> {
         Ok(())
     }
 
-    fn user_defined(&mut self, code: u8, (name, value): (&str, &str)) -> Result<(), EncodeError> {
+    fn user_defined(&mut self, code: u8, name: &str, value: &str) -> Result<(), EncodeError> {
         self.out.byte(code);
         let what = "name of a user-defined parameter";
         // fipa_services stores names without X- and does not add it here.
@@ -295,6 +295,6 @@ impl TextWriter for Writer<'_> {
     }
 
     fn user_defined_of_agent(&mut self, name: &str, value: &str) -> Result<(), EncodeError> {
-        self.user_defined(code::agent::USER_DEFINED, (name, value))
+        self.user_defined(code::agent::USER_DEFINED, name, value)
     }
 }

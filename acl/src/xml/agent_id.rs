@@ -268,13 +268,21 @@ pub(super) fn write(
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
     out.open("agent-identifier");
-    write_value(out, ("name", "id"), "agent name", agent.name(), form)?;
+    let name = ValueTag {
+        element: "name",
+        attribute: "id",
+    };
+    write_value(out, name, "agent name", agent.name(), form)?;
     // JADE writes the element even if it is empty.
     let as_jade = form == Form::Envelope && dialect == Dialect::Jade;
     if !agent.addresses().is_empty() || as_jade {
         out.open("addresses");
         for address in agent.addresses() {
-            write_value(out, ("url", "href"), "address", address, form)?;
+            let url = ValueTag {
+                element: "url",
+                attribute: "href",
+            };
+            write_value(out, url, "address", address, form)?;
         }
         out.close("addresses");
     }
@@ -310,18 +318,24 @@ pub(super) fn write(
     Ok(())
 }
 
+/// The element of a value, whose attribute has the value in a message.
+struct ValueTag {
+    element: &'static str,
+    attribute: &'static str,
+}
+
 fn write_value(
     out: &mut XmlWriter<'_>,
-    (element, attribute): (&str, &str),
+    tag: ValueTag,
     what: &'static str,
     value: &str,
     form: Form,
 ) -> Result<(), EncodeError> {
     if form == Form::Message {
-        return out.empty(element, attribute, what, value);
+        return out.empty(tag.element, tag.attribute, what, value);
     }
-    out.open(element);
+    out.open(tag.element);
     out.text_trimmed(what, value)?;
-    out.close(element);
+    out.close(tag.element);
     Ok(())
 }

@@ -7,13 +7,12 @@ use fipa_acl::Letter;
 use fipa_sds::{Entry, Reach, Role};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Parcel, Reaction, Realm, Report,
-    Ticket,
 };
 
 use super::action::Action;
 use super::ids::LaneKey;
 use super::inbox::{Inbox, Received, ask};
-use super::label::Label;
+use super::label::{ArrivalLink, HandedOver, Label, PredecessorNote};
 use super::principals::PrincipalError;
 use super::{Core, News, Now, ReadLetter, reading, work};
 use crate::gate::{LetterParts, Link};
@@ -74,7 +73,8 @@ impl Core {
         };
         match body {
             Body::Letter(letter) => {
-                self.handle_letter(now, (via, from, ticket), &label, (letter, read))
+                let link = ArrivalLink { via, from, ticket };
+                self.handle_letter(now, link, &label, (letter, read))
             }
             Body::Report(report) => self.handle_report(now, &label, &from, report),
             Body::Credit => self.handle_credit(now, &label, &from),
@@ -88,17 +88,18 @@ impl Core {
     fn handle_letter(
         &mut self,
         now: Now,
-        (via, from, ticket): (Kind, Hop, Option<Ticket>),
+        link: ArrivalLink,
         label: &Label,
         (letter, read): (Letter, Option<Box<ReadLetter>>),
     ) -> Reaction {
+        let ArrivalLink { via, from, ticket } = link;
         if let Err(refusal) = self.check_letter(label, &from, &letter, read.as_deref()) {
             return Reaction::Now(refusal);
         }
         let registration = label.stream.receiver;
         let Some(inbox) = self.agents.get_mut(&registration) else {
-            let unanswered = ticket.map(|ticket| (via, ticket));
-            let reaction = self.forward(now, (via, from, unanswered), label, letter, read);
+            let link = ArrivalLink { via, from, ticket };
+            let reaction = self.forward(now, link, label, letter, read);
             self.send_failures(now);
             return reaction;
         };
@@ -193,7 +194,11 @@ impl Core {
 
     fn handle_report(&mut self, now: Now, label: &Label, from: &Hop, report: Report) -> Reaction {
         if let Some(lane) = self.lane_of(label.stream, &label.receiver) {
-            let letter = (label.stream.receiver, label.sequence, label.transfer);
+            let letter = HandedOver {
+                registration: label.stream.receiver,
+                sequence: label.sequence,
+                transfer: label.transfer,
+            };
             self.with_lane(now, lane, |lane, table| {
                 lane.reported(now.instant, from, letter, report, table);
             });
@@ -215,9 +220,13 @@ impl Core {
     fn handle_predecessor(&mut self, now: Now, label: &Label, from: &Hop) -> Reaction {
         let mut answer = None;
         if let Some(lane) = self.lane_ids.get(&LaneKey::Custody(label.stream)) {
-            let letter = (label.sequence, label.after, label.transfer);
+            let note = PredecessorNote {
+                sequence: label.sequence,
+                after: label.after,
+                transfer: label.transfer,
+            };
             self.with_lane(now, *lane, |lane, table| {
-                answer = lane.handle_predecessor_note(now.instant, from, letter, table);
+                answer = lane.handle_predecessor_note(now.instant, from, note, table);
             });
         }
         self.send_failures(now);

@@ -15,6 +15,7 @@ use super::action::Action;
 use super::custody_budget::CustodyBudget;
 use super::departed::Departed;
 use super::ids::{LaneId, registration_by_name};
+use super::label::PredecessorNote;
 use super::notes::{Note, Notes, note_parcel};
 use super::routes::Routes;
 use super::tally::Tallies;
@@ -220,13 +221,13 @@ impl AttemptTable {
         &mut self,
         stream: Stream,
         receiver: Arc<str>,
-        (sequence, after, transfer): (u64, u64, u64),
+        note: PredecessorNote,
         location: Location,
     ) {
         let parcel = Parcel {
-            after,
-            transfer,
-            ..note_parcel(stream, receiver, sequence, Body::Predecessor)
+            after: note.after,
+            transfer: note.transfer,
+            ..note_parcel(stream, receiver, note.sequence, Body::Predecessor)
         };
         self.note(Note::once(location, parcel));
     }

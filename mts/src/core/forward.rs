@@ -5,14 +5,13 @@ use std::time::{Duration, Instant};
 use fipa_acl::{DecodeError, Letter};
 use fipa_sds::{Entry, Source};
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Location, PeerId, Reaction, Signature, Ticket,
-    log_limit,
+    Answer, FailureReason, Hop, Incarnation, Location, PeerId, Reaction, Signature, log_limit,
 };
 use smallvec::smallvec;
 
 use super::ids::LaneKey;
 use super::inbox::link_of;
-use super::label::Label;
+use super::label::{ArrivalLink, Label};
 use super::lane::OpenLetter;
 use super::origin::{Origin, Upstream};
 use super::{Core, MAX_DEADLINE, News, Now, ReadLetter};
@@ -30,16 +29,17 @@ const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
 
 impl Core {
     /// Takes a letter for an agent of another process into custody, or returns the reason why not.
-    /// `unanswered` is the arrival that may be answered later, `read` has the parts of the
-    /// letter.
+    /// `read` has the parts of the letter.
     pub(super) fn forward(
         &mut self,
         now: Now,
-        (via, from, unanswered): (Kind, Hop, Option<(Kind, Ticket)>),
+        link: ArrivalLink,
         label: &Label,
         letter: Letter,
         read: Option<Box<ReadLetter>>,
     ) -> Reaction {
+        let ArrivalLink { via, from, ticket } = link;
+        let unanswered = ticket.map(|ticket| (via, ticket));
         let (parts, envelope) = match read {
             Some(read) => (read.parts, read.envelope),
             None => (None, None),
@@ -70,10 +70,9 @@ impl Core {
         if let Some(id) = self.lane_ids.get(&key).copied() {
             let mut not_adopted = Some(upstream);
             self.with_lane(now, id, |lane, table| {
-                let letter = (label.sequence, label.after);
                 not_adopted = not_adopted
                     .take()
-                    .and_then(|it| lane.adopt(now.instant, letter, it, table).err());
+                    .and_then(|it| lane.adopt(now.instant, label, it, table).err());
             });
             upstream = match not_adopted {
                 Some(upstream) => upstream,

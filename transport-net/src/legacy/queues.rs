@@ -136,6 +136,13 @@ impl Default for Shared {
     }
 }
 
+/// The surroundings of the tasks that send to legacy peers.
+pub(crate) struct SenderContext<'a> {
+    pub(crate) limits: &'a NetLimits,
+    pub(crate) runtime: &'a Handle,
+    pub(crate) sink: Arc<dyn Sink>,
+}
+
 impl LegacySenders {
     /// Queues a parcel for a legacy peer, and starts the task of its location with the sender that
     /// `sender` makes, if there is none.
@@ -144,12 +151,17 @@ impl LegacySenders {
     /// When the parcel cannot be queued.
     pub(crate) fn send<S: LegacySender>(
         &self,
-        (limits, runtime, sink): (&NetLimits, &Handle, Arc<dyn Sink>),
+        context: SenderContext<'_>,
         attempt: AttemptId,
         to: &Location,
         parcel: Parcel,
         sender: impl FnOnce() -> S,
     ) -> Result<(), TransportError> {
+        let SenderContext {
+            limits,
+            runtime,
+            sink,
+        } = context;
         if self.take(limits, attempt, to, parcel)? {
             let (most, to_task) = (limits.max_connections, to.clone());
             let task = runtime.spawn(run(self.clone(), most, sink, to_task, sender()));

@@ -268,7 +268,7 @@ impl Security {
     }
 
     /// Whether the credentials still trust a peer that has presented this. The end of a trusted certificate
-    /// does not count here, see [`left`](Self::left).
+    /// does not count here, see [`time_left`](Self::time_left).
     fn still_trusts(&self, evidence: &Evidence) -> bool {
         let known = Arc::clone(&self.now.read().known);
         match evidence {

@@ -68,11 +68,21 @@ counters! {
     accept_failures,
 }
 
+/// Progress of writing on a connection.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Written {
+    /// Number of parcels that were handed to the kernel.
+    pub(crate) parcels: u64,
+    /// Number of writes.
+    pub(crate) writes: u64,
+}
+
 impl Tally {
     /// Counts parcels that were handed to the kernel, and writes.
-    pub(crate) fn add_written(&self, (parcels, writes): (u64, u64)) {
-        self.parcels_out.fetch_add(parcels, Ordering::Relaxed);
-        self.writes.fetch_add(writes, Ordering::Relaxed);
+    pub(crate) fn add_written(&self, written: Written) {
+        self.parcels_out
+            .fetch_add(written.parcels, Ordering::Relaxed);
+        self.writes.fetch_add(written.writes, Ordering::Relaxed);
     }
 }
 

@@ -29,6 +29,7 @@ pub use self::config::TcpConfig;
 use self::endpoint::TcpEndpoint;
 use self::legacy_sender::TcpSender;
 use crate::end::ConnectionEnd;
+use crate::legacy::queues::SenderContext;
 use crate::sockets;
 use crate::stream::config::StreamConfig;
 use crate::stream::counters::Counters;
@@ -103,7 +104,11 @@ impl TcpTransport {
             return Err(ConnectionEnd::Closed.after());
         };
         let endpoint = &self.endpoint;
-        let context = (endpoint.limits(), &endpoint.runtime, sink);
+        let context = SenderContext {
+            limits: endpoint.limits(),
+            runtime: &endpoint.runtime,
+            sink,
+        };
         let sender = || TcpSender {
             endpoint: endpoint.clone(),
             to: to.clone(),

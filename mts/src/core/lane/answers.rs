@@ -10,6 +10,7 @@ use fipa_transport::{
 
 use super::super::attempts::AttemptTable;
 use super::super::ids::registration_of;
+use super::super::label::HandedOver;
 use super::super::origin::Settlement;
 use super::super::rules::{self, AttemptEnd, Belief, Cause, CustodyReport};
 use super::super::tally::Tally;
@@ -309,16 +310,20 @@ impl Lane {
         self.letters[index].failed_at(location, error);
     }
 
-    /// Handles this service's report that the custody of a letter, from the hand-over `transfer`,
-    /// has ended.
+    /// Handles this service's report that the custody of a letter has ended.
     pub(crate) fn reported(
         &mut self,
         now: Instant,
         from: &Hop,
-        (registration, sequence, transfer): (Incarnation, u64, u64),
+        letter: HandedOver,
         report: Report,
         table: &mut AttemptTable,
     ) {
+        let HandedOver {
+            registration,
+            sequence,
+            transfer,
+        } = letter;
         let Some(index) = self.index(sequence) else {
             return;
         };

@@ -8,9 +8,10 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use fipa_transport::{Answer, Hop, Incarnation, TransportError, TransportErrorKind};
+use fipa_transport::{Answer, Hop, TransportError, TransportErrorKind};
 
 use super::super::attempts::AttemptTable;
+use super::super::label::{HandedOver, Label, PredecessorNote};
 use super::super::origin::{Settlement, Upstream};
 use super::super::rules::{self, AttemptEnd, Cause, HoldDecision};
 use super::super::work;
@@ -40,17 +41,17 @@ impl Lane {
     pub(crate) fn adopt(
         &mut self,
         now: Instant,
-        (sequence, after): (u64, u64),
+        label: &Label,
         upstream: Upstream,
         table: &mut AttemptTable,
     ) -> Result<(), Upstream> {
-        let Some(index) = self.index(sequence) else {
+        let Some(index) = self.index(label.sequence) else {
             return Err(upstream);
         };
         let open_letter = &mut self.letters[index];
         open_letter.custody_taken(table);
         open_letter.add_upstream(upstream);
-        self.lower_predecessor(index, after, table);
+        self.lower_predecessor(index, label.after, table);
         self.pump(now, table);
         Ok(())
     }
@@ -62,12 +63,12 @@ impl Lane {
         &mut self,
         now: Instant,
         from: &Hop,
-        (sequence, after, transfer): (u64, u64, u64),
+        note: PredecessorNote,
         table: &mut AttemptTable,
     ) -> Option<Answer> {
-        let index = self.index(sequence);
-        let index = index.filter(|index| self.letters[*index].came_from(from, transfer))?;
-        self.lower_predecessor(index, after, table);
+        let index = self.index(note.sequence);
+        let index = index.filter(|index| self.letters[*index].came_from(from, note.transfer))?;
+        self.lower_predecessor(index, note.after, table);
         self.pump(now, table);
         Some(match self.busy {
             true => Answer::Busy,
@@ -121,8 +122,12 @@ impl Lane {
             let (attempt, location) = (*attempt, location.clone());
             let stream = self.stream_of(open_letter);
             let after = self.after(index);
-            let letter = (open_letter.sequence, after, attempt.0);
-            table.predecessor(stream, self.receiver.clone(), letter, location);
+            let note = PredecessorNote {
+                sequence: open_letter.sequence,
+                after,
+                transfer: attempt.0,
+            };
+            table.predecessor(stream, self.receiver.clone(), note, location);
             let open_letter = &mut self.letters[index];
             open_letter.after = open_letter.after.min(after);
         }
@@ -139,7 +144,7 @@ impl Lane {
     pub(crate) fn custodian_denied(
         &mut self,
         now: Instant,
-        letter: (Incarnation, u64, u64),
+        letter: HandedOver,
         table: &mut AttemptTable,
     ) {
         if let Some(index) = self.in_custody(letter) {
@@ -153,7 +158,7 @@ impl Lane {
 
     /// Handles the answer of a custodian that it has the letter of this hand-over, and that the
     /// receiver's queue is full.
-    pub(crate) fn custodian_busy(&mut self, now: Instant, letter: (Incarnation, u64, u64)) {
+    pub(crate) fn custodian_busy(&mut self, now: Instant, letter: HandedOver) {
         if self.in_custody(letter).is_some() {
             self.was_full(now);
             self.ask_custodian_at(now + ASK_CUSTODIAN_AFTER);
@@ -161,14 +166,11 @@ impl Lane {
     }
 
     /// The letter of this registration, sequence and hand-over, if its custodian has it.
-    fn in_custody(
-        &self,
-        (registration, sequence, transfer): (Incarnation, u64, u64),
-    ) -> Option<usize> {
-        let index = self.index(sequence)?;
+    fn in_custody(&self, letter: HandedOver) -> Option<usize> {
+        let index = self.index(letter.sequence)?;
         let open_letter = &self.letters[index];
-        let is_meant = open_letter.registration == registration
-            && matches!(open_letter.progress.state, State::Custody { attempt, .. } if attempt.0 == transfer);
+        let is_meant = open_letter.registration == letter.registration
+            && matches!(open_letter.progress.state, State::Custody { attempt, .. } if attempt.0 == letter.transfer);
         is_meant.then_some(index)
     }
 
@@ -208,7 +210,12 @@ impl Lane {
                 let transfer = open_letter.progress.state.handed_over();
                 let transfer = transfer.map_or(0, |(attempt, _)| attempt.0);
                 let receiver = self.receiver.clone();
-                table.predecessor(stream, receiver, (sequence, lower, transfer), location);
+                let note = PredecessorNote {
+                    sequence,
+                    after: lower,
+                    transfer,
+                };
+                table.predecessor(stream, receiver, note, location);
             }
         }
     }

@@ -41,6 +41,7 @@ use self::pause::Pause;
 pub(crate) use self::pause::PauseEnd;
 use super::attempts::{AttemptTable, Purpose};
 use super::ids::{LaneId, LaneKey, registration_of};
+use super::label::PredecessorNote;
 use super::origin::{Origin, Settlement};
 use super::rules;
 use super::tally::Tally;
@@ -856,8 +857,12 @@ impl Lane {
         let after = self.after(index);
         if after < open_letter.after {
             let stream = self.stream_of(open_letter);
-            let letter = (open_letter.sequence, after, attempt.0);
-            table.predecessor(stream, Arc::clone(&self.receiver), letter, location.clone());
+            let note = PredecessorNote {
+                sequence: open_letter.sequence,
+                after,
+                transfer: attempt.0,
+            };
+            table.predecessor(stream, Arc::clone(&self.receiver), note, location.clone());
             self.letters[index].after = after;
         }
     }

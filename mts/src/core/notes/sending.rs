@@ -9,6 +9,7 @@ use fipa_transport::{
 
 use super::super::attempts::{AttemptTable, Purpose};
 use super::super::ids::LaneId;
+use super::super::label::HandedOver;
 use super::super::lane::PauseEnd;
 use super::super::{Core, Now, work};
 use super::{AFTER_ANSWER, Due, Note, PROBES, ROOM_TRIES, TIMERS_AT_ONCE, Timer, source_of};
@@ -184,7 +185,11 @@ impl Core {
         }
         let (stream, sequence, transfer) = note.transfer();
         if let Some(lane) = self.lane_of(stream, &note.parcel.receiver) {
-            let letter = (stream.receiver, sequence, transfer);
+            let letter = HandedOver {
+                registration: stream.receiver,
+                sequence,
+                transfer,
+            };
             self.with_lane(now, lane, |lane, table| match is_busy {
                 true => lane.custodian_busy(now.instant, letter),
                 false => lane.custodian_denied(now.instant, letter, table),

@@ -53,7 +53,7 @@ pub use self::config::HttpConfig;
 use self::connections::Connections;
 use self::repeats::Repeats;
 use crate::end::ConnectionEnd;
-use crate::legacy::queues::LegacySenders;
+use crate::legacy::queues::{LegacySenders, SenderContext};
 use crate::sockets;
 use crate::stream::config::StreamConfig;
 use crate::stream::counters::Counters;
@@ -234,7 +234,11 @@ impl Transport for HttpTransport {
         let Some(sink) = endpoint.stream.sink() else {
             return Err(ConnectionEnd::Closed.after());
         };
-        let context = (endpoint.stream.limits(), &endpoint.stream.runtime, sink);
+        let context = SenderContext {
+            limits: endpoint.stream.limits(),
+            runtime: &endpoint.stream.runtime,
+            sink,
+        };
         let sender = || HttpSender::new(endpoint.clone(), to.clone());
         endpoint.senders.send(context, attempt, to, parcel, sender)
     }

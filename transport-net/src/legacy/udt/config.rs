@@ -89,6 +89,24 @@ pub struct UdtLimits {
     pub idle_close: Duration,
 }
 
+/// Letters that wait for a location.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct QueueLoad {
+    pub(super) letters: usize,
+    pub(super) bytes: usize,
+}
+
+impl std::ops::Add for QueueLoad {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            letters: self.letters + other.letters,
+            bytes: self.bytes + other.bytes,
+        }
+    }
+}
+
 impl UdtLimits {
     /// Returns the maximum number of connections that the peers at this address may open: at most
     /// half of all, for one address as for all loopback addresses together.
@@ -117,11 +135,11 @@ impl UdtLimits {
     ///
     /// # Errors
     /// When too much is queued.
-    pub(super) fn check_room(
-        &self,
-        (count, bytes): (usize, usize),
-        len: usize,
-    ) -> Result<(), TransportError> {
+    pub(super) fn check_room(&self, queued: QueueLoad, len: usize) -> Result<(), TransportError> {
+        let QueueLoad {
+            letters: count,
+            bytes,
+        } = queued;
         if count >= self.max_in_flight.max(1)
             || (bytes > 0 && bytes.saturating_add(len) > self.max_queued_bytes)
         {

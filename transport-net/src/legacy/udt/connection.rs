@@ -86,6 +86,14 @@ pub(crate) struct Connection {
     replies: Vec<Control>,
 }
 
+/// The sockets of a connection, by the numbers that UDT gives them.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SocketIds {
+    pub(crate) own: u32,
+    /// Zero until it is known.
+    pub(crate) peer: u32,
+}
+
 #[derive(Debug)]
 enum Role {
     /// This side opens the connection. Letters wait meanwhile.
@@ -100,25 +108,26 @@ impl Connection {
         let dialing = Dialing::new(OwnHandshake { id, initial }, now + limits.connect_timeout);
         let sender = Sender::new(limits.clone(), initial, now);
         let role = Role::Dialing(dialing, Box::new(sender));
-        Self::new(limits, (id, 0), initial, None, role, now)
+        let sockets = SocketIds { own: id, peer: 0 };
+        Self::new(limits, sockets, initial, None, role, now)
     }
 
     /// Creates a connection that a peer has opened, after the peer has returned its cookie.
     pub(crate) fn accepted(
         limits: UdtLimits,
-        ids: (u32, u32),
+        sockets: SocketIds,
         initial: u32,
         path: Path,
         receiver: Receiver,
         now: Instant,
     ) -> Self {
         let role = Role::Receiving(Box::new(receiver));
-        Self::new(limits, ids, initial, Some(path), role, now)
+        Self::new(limits, sockets, initial, Some(path), role, now)
     }
 
     fn new(
         limits: UdtLimits,
-        (id, peer_id): (u32, u32),
+        sockets: SocketIds,
         initial: u32,
         path: Option<Path>,
         role: Role,
@@ -126,8 +135,8 @@ impl Connection {
     ) -> Self {
         Self {
             limits,
-            id,
-            peer_id,
+            id: sockets.own,
+            peer_id: sockets.peer,
             initial,
             path,
             role,

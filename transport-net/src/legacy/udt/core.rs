@@ -21,7 +21,7 @@ use fipa_transport::{
 };
 
 use super::config::UdtLimits;
-use super::connection::Connection;
+use super::connection::{Connection, SocketIds};
 use super::counters::UdtCounters;
 use super::packet::{
     self, CONCLUSION, Control, DATAGRAMS, Handshake, MAX_PACKET, MIN_PACKET, Packet, REFUSAL,
@@ -162,11 +162,8 @@ impl Core {
         let dialed = self.dialed.get(to);
         let entry = dialed.and_then(|number| self.connections.get(*number));
         let load = match entry.and_then(|entry| entry.connection.sender()) {
-            Some(sender) => {
-                let queued = sender.load();
-                (waiting.0 + queued.0, waiting.1 + queued.1)
-            }
-            None if waiting.0 == 0 && !self.has_room_for_another_location() => {
+            Some(sender) => waiting + sender.load(),
+            None if waiting.letters == 0 && !self.has_room_for_another_location() => {
                 return Err(ConnectionEnd::TooManyConnections.after());
             }
             None => waiting,
@@ -493,9 +490,13 @@ impl Core {
         };
         let limits = self.limits.clone();
         let receiver = Receiver::new(limits, handshake.initial, max_packet, rate_limit, meter);
-        let ids = (self.fresh_socket(), handshake.socket);
+        let sockets = SocketIds {
+            own: self.fresh_socket(),
+            peer: handshake.socket,
+        };
         let limits = self.limits.clone();
-        let connection = Connection::accepted(limits, ids, handshake.initial, path, receiver, now);
+        let connection =
+            Connection::accepted(limits, sockets, handshake.initial, path, receiver, now);
         let answer = connection.answer(handshake, max_packet);
         let number = self.insert(connection, None, Some(origin));
         self.counters.accepted += 1;

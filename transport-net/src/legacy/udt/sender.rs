@@ -15,7 +15,7 @@ use bytes::Bytes;
 use fipa_transport::{Abandoned, AttemptId, Conclusion, TransportError};
 
 use super::SYN;
-use super::config::UdtLimits;
+use super::config::{QueueLoad, UdtLimits};
 use super::packet::{self, Ack, Data, HEADER, IP_AND_UDP, MESSAGES, Position, ReceiverState};
 use super::ranges::Ranges;
 use super::rate::RateControl;
@@ -152,8 +152,11 @@ impl Sender {
     }
 
     /// Returns the number of letters that wait or are not acknowledged, and of their bytes.
-    pub(crate) fn load(&self) -> (usize, usize) {
-        (self.waiting.len() + self.begun.len(), self.bytes)
+    pub(super) fn load(&self) -> QueueLoad {
+        QueueLoad {
+            letters: self.waiting.len() + self.begun.len(),
+            bytes: self.bytes,
+        }
     }
 
     /// Ends an attempt. The letter is not sent if no packet of it was sent.

@@ -13,6 +13,7 @@ use bytes::Bytes;
 use fipa_acl::Letter;
 use fipa_transport::{AttemptId, Location, TransportError};
 
+use super::config::QueueLoad;
 use super::too_large;
 use crate::legacy::dialect::translate;
 
@@ -77,9 +78,12 @@ impl Queue {
 
 impl Untranslated {
     /// Returns the number of letters that wait for this location, and of their bytes.
-    pub(crate) fn load(&self, to: &Location) -> (usize, usize) {
+    pub(super) fn load(&self, to: &Location) -> QueueLoad {
         let queue = self.queues.get(to);
-        queue.map_or((0, 0), |queue| (queue.letters.len(), queue.bytes))
+        queue.map_or_else(QueueLoad::default, |queue| QueueLoad {
+            letters: queue.letters.len(),
+            bytes: queue.bytes,
+        })
     }
 
     /// Returns the locations with letters.
@@ -214,10 +218,14 @@ mod tests {
             let starts = push(&mut untranslated, attempt, to);
             assert_eq!(starts, attempt == 1, "one task");
         }
-        assert_eq!(untranslated.load(&location(1)), (3, 30));
+        let (letters, bytes) = (3, 30);
+        assert_eq!(
+            untranslated.load(&location(1)),
+            QueueLoad { letters, bytes }
+        );
         assert_eq!(rest(&mut untranslated), [1, 4, 5, 2, 6, 3]);
         assert_empty(&untranslated);
-        assert_eq!(untranslated.load(&location(1)), (0, 0));
+        assert_eq!(untranslated.load(&location(1)), QueueLoad::default());
         assert!(push(&mut untranslated, 7, 1), "the task has ended");
     }
 
@@ -226,7 +234,14 @@ mod tests {
         let mut untranslated = Untranslated::default();
         push(&mut untranslated, 1, 1);
         untranslated.begin().unwrap();
-        assert_eq!(untranslated.load(&location(1)), (1, 10), "it counts");
+        assert_eq!(
+            untranslated.load(&location(1)),
+            QueueLoad {
+                letters: 1,
+                bytes: 10
+            },
+            "it counts"
+        );
         assert!(!push(&mut untranslated, 2, 1));
         assert!(!push(&mut untranslated, 3, 2));
         assert_eq!(untranslated.finish(), Some((AttemptId(1), location(1))));

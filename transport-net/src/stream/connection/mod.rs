@@ -16,6 +16,7 @@ use fipa_transport::{
 };
 
 use super::config::NetLimits;
+use super::counters::Written;
 use super::frame::{self, Frame};
 use super::outbox::{About, Outbox, Progress};
 use super::proof::Proof;
@@ -617,9 +618,11 @@ impl Connection {
     }
 
     /// Returns the numbers of parcels handed to the kernel, and of writes, since the last call.
-    pub(crate) fn take_written(&mut self) -> (u64, u64) {
-        let parcels = std::mem::take(&mut self.parcels_written);
-        (parcels, std::mem::take(&mut self.writes))
+    pub(crate) fn take_written(&mut self) -> Written {
+        Written {
+            parcels: std::mem::take(&mut self.parcels_written),
+            writes: std::mem::take(&mut self.writes),
+        }
     }
 
     /// Whether another frame is likely to follow soon: the peer has parcels to answer, or this side
