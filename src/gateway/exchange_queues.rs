@@ -33,7 +33,7 @@ const ADVANCE: Duration = Duration::from_secs(8);
 /// The unread letters of all peers.
 #[derive(Debug, Default)]
 pub(super) struct ExchangeQueues {
-    peers: HashMap<PeerId, PeerQueue>,
+    queues: HashMap<PeerId, PeerQueue>,
     /// The peers with letters, in the order of their turns.
     turns: VecDeque<PeerId>,
     bytes: usize,
@@ -70,7 +70,7 @@ impl ExchangeQueues {
     /// Adds a letter of a gateway, which this peer handed over.
     pub(super) fn push(&mut self, peer: &PeerId, gateway: Incarnation, content: &[u8]) {
         let charged = content.len() + PER_LETTER;
-        let queue = self.peers.entry(peer.clone()).or_default();
+        let queue = self.queues.entry(peer.clone()).or_default();
         if queue.gateways.is_empty() {
             self.turns.push_back(peer.clone());
         }
@@ -103,7 +103,7 @@ impl ExchangeQueues {
 
     /// Drops the latest letter of a gateway of the peer with most bytes.
     fn drop_latest(&mut self) -> bool {
-        let Some(queue) = self.peers.values_mut().max_by_key(|queue| queue.bytes) else {
+        let Some(queue) = self.queues.values_mut().max_by_key(|queue| queue.bytes) else {
             return false;
         };
         let mut gateways = queue.gateways.values_mut();
@@ -127,7 +127,7 @@ impl ExchangeQueues {
         let is_due = |peer: &PeerId| self.due(peer).is_none_or(|due| due <= now);
         let place = self.turns.iter().position(is_due)?;
         let peer = self.turns.remove(place)?;
-        let queue = self.peers.get_mut(&peer)?;
+        let queue = self.queues.get_mut(&peer)?;
         let gateway = queue.turns.pop_front()?;
         let letters = queue.gateways.get_mut(&gateway)?;
         let unread = letters.pop_front();
@@ -139,7 +139,7 @@ impl ExchangeQueues {
         queue.bytes -= freed;
         self.bytes -= freed;
         match queue.gateways.is_empty() {
-            true => drop(self.peers.remove(&peer)),
+            true => drop(self.queues.remove(&peer)),
             false => self.turns.push_back(peer.clone()),
         }
         Some(NextLetter {

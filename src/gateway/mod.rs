@@ -109,7 +109,7 @@ impl Gateway {
             let (key, feature) = ("security.keys", "secure");
             return Err(OpenError::NoFeature { key, feature });
         }
-        let contacts = Arc::new(KnownPeers::default());
+        let known_peers = Arc::new(KnownPeers::default());
         let exchange = Arc::new(Exchanging::new(Incarnation::random().as_u64()));
         let directories = Mutex::new(None);
         let (refusals, refused_dials) = (Refusals::default(), RefusedDials::default());
@@ -119,24 +119,24 @@ impl Gateway {
                 name: config.mts.name.as_str().into(),
                 gateway: true,
                 brief: false,
-                contacts: Some(Arc::clone(&contacts) as Arc<dyn Contacts>),
+                contacts: Some(Arc::clone(&known_peers) as Arc<dyn Contacts>),
                 #[cfg(feature = "secure")]
                 security: guard.as_ref().map(Guard::security),
                 refusals: refusals.clone(),
                 refused_dials: refused_dials.clone(),
                 view: &|host, mts| {
-                    contacts.neighbors.name_own(&config.mts.name);
+                    known_peers.neighbors.name_own(&config.mts.name);
                     let network = network(config, mts)?;
                     let exchanged = exchange.directory() as Arc<dyn Directory>;
                     let announced = network.clone().map(Network::directory);
                     let legacy = Arc::new(legacy_peers(config)?) as Arc<dyn Directory>;
                     let known = announced.into_iter().chain([exchanged, legacy]).collect();
                     let known = Arc::new(MergedDirectory::new(known));
-                    let contacted = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
+                    let contacted = Arc::clone(&known_peers.directory) as Arc<dyn Directory>;
                     let remote = Arc::clone(&known) as Arc<dyn Directory>;
                     let view: Arc<dyn Directory> = Arc::new(View {
                         all: MergedDirectory::new(vec![host, remote, contacted]),
-                        neighbors: Arc::clone(&contacts.neighbors),
+                        neighbors: Arc::clone(&known_peers.neighbors),
                     });
                     *directories.lock() = Some((network, known, Arc::clone(&view)));
                     Ok(view)
@@ -155,8 +155,8 @@ impl Gateway {
             &service.dir,
             trust,
             Arc::clone(&view),
-            Arc::clone(&contacts.directory),
-            Arc::clone(&contacts.neighbors),
+            Arc::clone(&known_peers.directory),
+            Arc::clone(&known_peers.neighbors),
         ));
         let mut gateway = Self {
             config: config.clone(),
@@ -165,7 +165,7 @@ impl Gateway {
             owner: Owner::this(),
             network,
             view,
-            neighbors: Arc::clone(&contacts.neighbors),
+            neighbors: Arc::clone(&known_peers.neighbors),
             exchange,
             state,
             tasks: Vec::new(),
@@ -184,25 +184,25 @@ impl Gateway {
             host: Arc::clone(&gateway.service.host),
             network: gateway.network.clone().map(Network::directory),
             known: Arc::clone(&known),
-            contacts: Arc::clone(&contacts.directory),
+            contacts: Arc::clone(&known_peers.directory),
             service: Arc::clone(&gateway.service),
             only_loopback: announces_on_loopback_only(config),
             pace: Default::default(),
         });
         // From here on, the sender of a letter from another host is published on this host before
         // the letter is delivered.
-        *contacts.publisher.lock() = Some(Arc::clone(&publisher));
-        contacts.network.lock().clone_from(&gateway.network);
+        *known_peers.publisher.lock() = Some(Arc::clone(&publisher));
+        known_peers.network.lock().clone_from(&gateway.network);
         let publish_task = PublishTask::new(publisher, gateway.network.clone());
         gateway.tasks.push(tokio::spawn(publish_task.run()));
         let follow = follow_locations(Arc::clone(&gateway.service), Arc::clone(&gateway.neighbors));
         gateway.tasks.push(tokio::spawn(follow));
         #[cfg(feature = "secure")]
-        let contacted = Arc::clone(&contacts.directory);
+        let contacted = Arc::clone(&known_peers.directory);
         gateway.open_for_letters(
             config,
             known,
-            contacts,
+            known_peers,
             refusals,
             refused_dials,
             predecessor,
@@ -223,7 +223,7 @@ impl Gateway {
         &mut self,
         config: &Config,
         known: Arc<MergedDirectory>,
-        contacts: Arc<KnownPeers>,
+        known_peers: Arc<KnownPeers>,
         refusals: Refusals,
         refused_dials: RefusedDials,
         predecessor: Arc<Predecessor>,
@@ -242,7 +242,7 @@ impl Gateway {
             neighbors: Arc::clone(&self.neighbors),
             view: Arc::clone(&self.view),
             exchange: Arc::clone(&self.exchange),
-            contacts,
+            known_peers,
             configuration: Arc::clone(&self.configuration),
             refusals,
             refused_dials,
@@ -268,7 +268,7 @@ impl Gateway {
         self.tasks
             .push(tokio::spawn(Arc::clone(&exchange).read_letters()));
         self.tasks.push(tokio::spawn(exchange.run(means, known)));
-        let peers = peers(config);
+        let peers = static_peers(config);
         self.neighbors.name_peers(peers.clone());
         self.service.mts.keep_in_touch(peers);
         Ok(())
@@ -370,7 +370,7 @@ impl Gateway {
             _ => true,
         });
         self.service.reorder(config);
-        let peers = peers(config);
+        let peers = static_peers(config);
         self.neighbors.name_peers(peers.clone());
         self.service.mts.keep_in_touch(peers);
         self.config.mts.deadline = config.mts.deadline;
@@ -532,13 +532,13 @@ fn is_legacy(peer: &crate::config::PeerConfig) -> bool {
 
 /// Returns the agents of legacy peers that the configuration names.
 fn legacy_peers(config: &Config) -> Result<StaticDirectory, OpenError> {
-    let peers = config.discovery.peers.iter().filter(|peer| is_legacy(peer));
-    let agents = peers.map(|peer| (peer.name.as_str(), peer.locations.clone()));
+    let legacy = config.discovery.peers.iter().filter(|peer| is_legacy(peer));
+    let agents = legacy.map(|peer| (peer.name.as_str(), peer.locations.clone()));
     StaticDirectory::new(agents).map_err(OpenError::StaticPeers)
 }
 
 /// Returns the gateways that the configuration names.
-fn peers(config: &Config) -> Vec<Peer> {
+fn static_peers(config: &Config) -> Vec<Peer> {
     let peers = config
         .discovery
         .peers

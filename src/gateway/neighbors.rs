@@ -36,7 +36,7 @@ pub(crate) struct Neighbors {
 #[derive(Debug, Default)]
 struct State {
     present: HashMap<Incarnation, Neighbor>,
-    peers: Vec<Peer>,
+    static_peers: Vec<Peer>,
     /// Locations at which an attempt failed, and the cause.
     suspected: HashMap<Location, TransportErrorKind>,
     /// The name of this gateway.
@@ -121,7 +121,7 @@ impl Neighbors {
 
     /// Sets the peers that the configuration names, with their locations.
     pub(crate) fn name_peers(&self, peers: Vec<Peer>) {
-        self.state.lock().peers = peers;
+        self.state.lock().static_peers = peers;
     }
 
     /// Whether this gateway or a neighbor has the name.
@@ -283,7 +283,7 @@ impl State {
             let dialed = peer.dialed.as_ref();
             dialed.is_some_and(|dialed| listed.locations.contains(dialed))
         };
-        let listed = self.peers.iter().find(named);
+        let listed = self.static_peers.iter().find(named);
         if let Some(listed) = listed
             && *listed.name != *peer.name
         {

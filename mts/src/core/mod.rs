@@ -147,7 +147,7 @@ pub struct Core {
     agents: Map<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
     waiting: WaitingLetters,
-    peers: Peers,
+    static_peers: Peers,
     principals: Principals,
     reader: LetterReader,
     failure_limit: FailureLimit,
@@ -193,7 +193,7 @@ impl Core {
             agents: Map::default(),
             timers: BinaryHeap::new(),
             waiting: WaitingLetters::default(),
-            peers: Peers::default(),
+            static_peers: Peers::default(),
             principals: Principals::default(),
             reader,
             failure_limit: FailureLimit::default(),
@@ -322,7 +322,7 @@ impl Core {
             Some(Purpose::Note(note)) => self.note_concluded(now, *note, conclusion),
             Some(Purpose::PeerCheck { peer }) => {
                 let asked = (peer, attempt);
-                self.peers
+                self.static_peers
                     .concluded(now.instant, asked, conclusion, &mut self.table);
             }
             None => {}
@@ -363,7 +363,8 @@ impl Core {
             }
         }
         self.handle_note_timers(now);
-        self.peers.handle_timeout(now.instant, &mut self.table);
+        self.static_peers
+            .handle_timeout(now.instant, &mut self.table);
         self.send_failures(now);
         self.forget_idle_lanes(now);
     }
@@ -373,7 +374,7 @@ impl Core {
     pub fn reorder(&mut self, now: Now, order: Vec<Kind>, routes: Vec<(Pattern, Vec<Kind>)>) {
         self.table.config.order = order;
         self.table.config.routes = routes;
-        self.peers.reorder(now.instant, &mut self.table);
+        self.static_peers.reorder(now.instant, &mut self.table);
         self.handle_directory_change(now);
     }
 
@@ -388,7 +389,7 @@ impl Core {
     pub fn poll_timeout(&self) -> Option<Instant> {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
         let notes = self.table.notes.due();
-        let others = earlier(self.peers.due(), self.passes.due());
+        let others = earlier(self.static_peers.due(), self.passes.due());
         earlier(earlier(lanes, notes), earlier(others, self.waiting.due()))
     }
 

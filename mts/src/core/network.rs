@@ -58,20 +58,20 @@ impl Core {
 
     /// Sets the services to keep in touch with.
     pub fn keep_in_touch(&mut self, now: Now, peers: Vec<Peer>) {
-        self.peers.set(now.instant, peers, &mut self.table);
+        self.static_peers.set(now.instant, peers, &mut self.table);
     }
 
     /// Returns the state of contact with each of these services.
     #[must_use]
     pub fn peers(&self, now: Now) -> Vec<PeerState> {
-        self.peers.states(now.instant)
+        self.static_peers.states(now.instant)
     }
 
     /// Handles the end of a connection that was opened for this location.
     pub fn handle_disconnected(&mut self, now: Now, peer: &Introduction) {
         self.principals.disconnected(peer);
         if let Some(dialed) = &peer.dialed {
-            self.peers.disconnected(now.instant, dialed);
+            self.static_peers.disconnected(now.instant, dialed);
         }
     }
 
@@ -132,7 +132,7 @@ impl Core {
             .routes
             .forget_failures(|location| is_at(service, location));
         if service.is_none() {
-            self.peers.ask_again(now.instant, &mut self.table);
+            self.static_peers.ask_again(now.instant, &mut self.table);
         } else if !had_failed {
             // No letter waits for this service. A peer decides how often it connects.
             return;

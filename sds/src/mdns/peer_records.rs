@@ -27,7 +27,7 @@ pub(super) struct PeerRecords {
     gateways: HashMap<Incarnation, Gateway>,
     queue: VecDeque<Arc<str>>,
     /// Records in the queue that have no gateway (legacy peers).
-    peers: HashSet<Arc<str>>,
+    legacy_queued: HashSet<Arc<str>>,
     /// Records of gateways that have ended.
     ended: Vec<Arc<str>>,
     next: Option<Instant>,
@@ -137,11 +137,11 @@ impl PeerRecords {
     /// Drops later copies of queued names when half of the queue may be copies: a gateway that stays silent
     /// is suspected again and again, and the network decides how many gateways do so.
     fn shorten_queue(&mut self) {
-        if self.queue.len() <= 2 * (self.records.len() + self.peers.len()) + BATCH {
+        if self.queue.len() <= 2 * (self.records.len() + self.legacy_queued.len()) + BATCH {
             return;
         }
         let mut queued = HashSet::new();
-        let (records, peers) = (&self.records, &self.peers);
+        let (records, peers) = (&self.records, &self.legacy_queued);
         self.queue.retain(|name| {
             (records.contains_key(name) || peers.contains(name)) && queued.insert(Arc::clone(name))
         });
@@ -163,7 +163,7 @@ impl PeerRecords {
 
     /// Queues a record of a legacy peer, which has no gateway, for verification.
     pub(super) fn verify(&mut self, fullname: &Arc<str>) {
-        if self.peers.insert(Arc::clone(fullname)) {
+        if self.legacy_queued.insert(Arc::clone(fullname)) {
             self.queue.push_front(Arc::clone(fullname));
         }
     }
@@ -185,7 +185,7 @@ impl PeerRecords {
         }
         self.next = Some(now + PAUSE);
         let batch = self.queue.len().min(BATCH);
-        let (records, peers) = (&self.records, &mut self.peers);
+        let (records, peers) = (&self.records, &mut self.legacy_queued);
         let batch = self.queue.drain(..batch);
         batch
             .filter(|name| peers.remove(name) || records.contains_key(name))

@@ -46,7 +46,7 @@ pub(crate) struct GatewayAgent {
     pub(crate) neighbors: Arc<Neighbors>,
     pub(crate) view: Arc<dyn Directory>,
     pub(super) exchange: Arc<Exchanging>,
-    pub(super) contacts: Arc<KnownPeers>,
+    pub(super) known_peers: Arc<KnownPeers>,
     /// The values of the configuration in use, by key.
     pub(super) configuration: Arc<Mutex<BTreeMap<String, String>>>,
     /// The connections that were refused because of keys or versions.
@@ -191,8 +191,8 @@ impl GatewayAgent {
             false => used,
             true => {
                 let grounds = Grounds {
-                    takers: &self.contacts.takers,
-                    contacts: &self.contacts.directory,
+                    takers: &self.known_peers.takers,
+                    contacts: &self.known_peers.directory,
                     networks: &self.networks,
                     own: listened_at(&self.service.all_locations()),
                 };
@@ -203,10 +203,10 @@ impl GatewayAgent {
                 judged.permitted
             }
         };
-        self.contacts
+        self.known_peers
             .introduce(&name, dialed, !is_received)
             .map_err(|error| ErrorChain(&error).to_string())?;
-        self.contacts.publish();
+        self.known_peers.publish();
         Ok(())
     }
 

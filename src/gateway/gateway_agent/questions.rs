@@ -35,18 +35,18 @@ const QUESTION_BYTES_PER_SECOND: f64 = 64.0 * 1024.0;
 #[derive(Debug, Default)]
 pub(in crate::gateway) struct QuestionRates {
     /// The peers that asked within the time in which a bucket fills.
-    peers: HashMap<PeerId, TokenBucket>,
+    rate_limits: HashMap<PeerId, TokenBucket>,
 }
 
 impl QuestionRates {
     /// Whether a question of this length is answered.
     fn admits(&mut self, now: Instant, peer: &PeerId, len: usize) -> bool {
         let memory = Duration::from_secs_f64(QUESTION_BYTES / QUESTION_BYTES_PER_SECOND);
-        if !self.peers.contains_key(peer) {
-            self.peers
+        if !self.rate_limits.contains_key(peer) {
+            self.rate_limits
                 .retain(|_, bucket| now.saturating_duration_since(bucket.asked()) < memory);
         }
-        let bucket = self.peers.entry(peer.clone());
+        let bucket = self.rate_limits.entry(peer.clone());
         let bucket = bucket.or_insert_with(|| TokenBucket::new(QUESTION_BYTES, now));
         let (rate, burst) = (QUESTION_BYTES_PER_SECOND, QUESTION_BYTES);
         bucket.take_of(len as f64, rate, burst, now)
@@ -465,7 +465,7 @@ mod tests {
             rates.admits(now, &peer(last), largest);
         }
         rates.admits(now + Duration::from_secs(60), &peer(0), largest);
-        assert_eq!(rates.peers.len(), 1, "the others are forgotten");
+        assert_eq!(rates.rate_limits.len(), 1, "the others are forgotten");
     }
 
     fn registered(registrations: &[u64]) -> Answer {

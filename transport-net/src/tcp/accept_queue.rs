@@ -40,7 +40,7 @@ pub(crate) struct AcceptQueue(Mutex<State>);
 struct State {
     closed: bool,
     last_ticket: u64,
-    peers: HashMap<IpAddr, Peer>,
+    by_address: HashMap<IpAddr, Peer>,
     /// Number of connections that may be read.
     reading: usize,
     /// Number of connections that may not be read yet.
@@ -106,7 +106,7 @@ impl State {
         if self.closed {
             return Err(Full::Closed);
         }
-        let of_home = self.peers.get(&home).map_or(0, Peer::waiting);
+        let of_home = self.by_address.get(&home).map_or(0, Peer::waiting);
         let full = if of_home >= limits.max_unread_per_address.max(1) {
             Some(Full::Address)
         } else if self.waiting >= limits.max_unread.max(1) {
@@ -125,7 +125,7 @@ impl State {
         }
         self.last_ticket += 1;
         let ticket = self.last_ticket;
-        let peer = self.peers.entry(home).or_default();
+        let peer = self.by_address.entry(home).or_default();
         peer.turns.insert(ticket, entry);
         self.waiting += 1;
         self.grant(limits, home);
@@ -134,21 +134,21 @@ impl State {
 
     /// Returns the address with the most waiting connections.
     fn most_waiting(&self) -> Option<IpAddr> {
-        let peers = self.peers.iter();
+        let peers = self.by_address.iter();
         let most = peers.max_by_key(|(_, peer)| peer.waiting());
         most.map(|(home, _)| *home)
     }
 
     /// Returns the oldest connection of an address that has not sent a byte.
     fn silent(&self, home: IpAddr, is_silent: impl Fn(&Entry) -> bool) -> Option<u64> {
-        let mut turns = self.peers.get(&home)?.turns.iter();
+        let mut turns = self.by_address.get(&home)?.turns.iter();
         let oldest = turns.find(|(_, entry)| entry.task.is_some() && is_silent(entry));
         oldest.map(|(ticket, _)| *ticket)
     }
 
     /// Removes a connection, and grants its permissions to others.
     fn remove(&mut self, limits: &NetLimits, home: IpAddr, ticket: u64) -> Option<Entry> {
-        let peer = self.peers.get_mut(&home)?;
+        let peer = self.by_address.get_mut(&home)?;
         let entry = peer.turns.remove(&ticket)?;
         self.departures = self.departures.wrapping_add(1);
         match entry.phase {
@@ -160,7 +160,7 @@ impl State {
         }
         peer.wake_first();
         if peer.turns.is_empty() {
-            self.peers.remove(&home);
+            self.by_address.remove(&home);
         }
         self.grant(limits, home);
         if self.reading < limits.max_strangers {
@@ -175,7 +175,7 @@ impl State {
     }
 
     fn grant_one(&mut self, limits: &NetLimits, home: IpAddr) -> bool {
-        let Some(peer) = self.peers.get_mut(&home) else {
+        let Some(peer) = self.by_address.get_mut(&home) else {
             return false;
         };
         // One connection of each address may always be read, so that no address blocks another.
@@ -200,7 +200,7 @@ impl State {
     /// Lets connections of all addresses be read, first those of the address with the fewest.
     fn grant_others(&mut self, limits: &NetLimits) {
         while self.reading < limits.max_strangers {
-            let peers = self.peers.iter();
+            let peers = self.by_address.iter();
             let waits = peers.filter(|(_, peer)| {
                 peer.waiting() > 0 && peer.reading < limits.max_reads_per_address
             });
@@ -216,7 +216,7 @@ impl State {
     /// connections of the address are stalled and others wait, the older half is evicted.
     fn stall(&mut self, limits: &NetLimits, home: IpAddr, ticket: u64) -> Evicted {
         let mut evicted = Evicted::new();
-        let Some(peer) = self.peers.get_mut(&home) else {
+        let Some(peer) = self.by_address.get_mut(&home) else {
             return evicted;
         };
         match peer.turns.get_mut(&ticket) {
@@ -243,7 +243,7 @@ impl State {
 
     /// Whether no connection that was accepted before this one has a turn.
     fn is_first(&self, home: IpAddr, ticket: u64) -> bool {
-        let Some(peer) = self.peers.get(&home) else {
+        let Some(peer) = self.by_address.get(&home) else {
             return true;
         };
         match peer.turns.get(&ticket) {
@@ -335,7 +335,10 @@ impl AcceptQueue {
     pub(crate) fn close(&self) {
         let mut state = self.0.lock();
         state.closed = true;
-        let entries = state.peers.values().flat_map(|peer| peer.turns.values());
+        let entries = state
+            .by_address
+            .values()
+            .flat_map(|peer| peer.turns.values());
         let tasks: Vec<_> = entries.filter_map(|entry| entry.task.clone()).collect();
         drop(state);
         for task in tasks {
@@ -403,7 +406,7 @@ impl QueueTurn {
 
     fn with_entry<T>(&self, change: impl FnOnce(&mut Entry) -> T) -> Option<T> {
         let mut state = self.state();
-        let peer = state.peers.get_mut(&self.home)?;
+        let peer = state.by_address.get_mut(&self.home)?;
         peer.turns.get_mut(&self.ticket).map(change)
     }
 }
@@ -450,7 +453,11 @@ mod tests {
     }
 
     fn may_read(state: &State, home: IpAddr) -> Vec<u64> {
-        let turns = state.peers.get(&home).into_iter().flat_map(|p| &p.turns);
+        let turns = state
+            .by_address
+            .get(&home)
+            .into_iter()
+            .flat_map(|p| &p.turns);
         let reading = turns.filter(|(_, entry)| entry.phase != Phase::Waiting);
         reading.map(|(ticket, _)| *ticket).collect()
     }
@@ -469,7 +476,7 @@ mod tests {
         for ticket in &tickets[1..] {
             state.remove(&limits(), HERE, *ticket);
         }
-        assert!(state.peers.is_empty());
+        assert!(state.by_address.is_empty());
         assert_eq!((state.reading, state.waiting), (0, 0));
     }
 
@@ -496,12 +503,12 @@ mod tests {
         }
         let runtime = tokio::runtime::Builder::new_current_thread().build();
         let task = runtime.unwrap().spawn(async {}).abort_handle();
-        let turns = &mut state.peers.get_mut(&HERE).unwrap().turns;
+        let turns = &mut state.by_address.get_mut(&HERE).unwrap().turns;
         turns.get_mut(&silent).unwrap().task = Some(task);
         let admitted = state.admit(&limits(), HERE, entry(), |entry| entry.task.is_some());
         let (_, evicted) = admitted.unwrap();
         assert_eq!(evicted.len(), 1);
-        assert!(!state.peers[&HERE].turns.contains_key(&silent));
+        assert!(!state.by_address[&HERE].turns.contains_key(&silent));
     }
 
     #[test]

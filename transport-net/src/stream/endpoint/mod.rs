@@ -111,7 +111,7 @@ struct Registry {
     /// The quota keys of the accepted connections.
     quota_keys: HashMap<u32, QuotaKey>,
     /// The introduced peers of the links.
-    peers: HashMap<u32, Peer>,
+    peer_by_link: HashMap<u32, Peer>,
     /// Accepted connections before the peer's hello, oldest first, with their origin and task.
     unproved: BTreeMap<u64, (Home, Option<AbortHandle>)>,
     last_unproved: u64,
@@ -725,7 +725,7 @@ impl Endpoint {
         let home = home.map(|address| Source::Address(address).home());
         let registry = self.registry.lock();
         let is_there = |link: &&Arc<Link>| {
-            let peer = registry.peers.get(&link.number);
+            let peer = registry.peer_by_link.get(&link.number);
             peer.is_some_and(|peer| Some(peer.home) == home)
         };
         let links = [&registry.any, &registry.large].into_iter().flat_map(|it| {
@@ -930,7 +930,10 @@ impl Endpoint {
             "it claims the incarnation of a connected service whose connection is alive";
         let home = {
             let registry = self.registry.lock();
-            registry.peers.get(&other.number).map(|peer| peer.home)
+            registry
+                .peer_by_link
+                .get(&other.number)
+                .map(|peer| peer.home)
         };
         if home != Some(from.home()) {
             return self.refuse(from, WHY);
@@ -984,7 +987,7 @@ impl Endpoint {
         {
             registry.links.remove(&link.number);
             registry.quota_keys.remove(&link.number);
-            registry.peers.remove(&link.number);
+            registry.peer_by_link.remove(&link.number);
         }
         let is_other = |other: &Arc<Link>| !Arc::ptr_eq(other, link);
         registry.inbound.retain(|_, (_, other)| is_other(other));
@@ -1112,7 +1115,8 @@ impl Registry {
         let mut affected = SupersededConnections::default();
         let incarnation = this.identity.incarnation;
         let others = self.links.values().filter(|it| it.number != link.number);
-        for (other, peer) in others.filter_map(|it| Some((it, self.peers.get(&it.number)?))) {
+        for (other, peer) in others.filter_map(|it| Some((it, self.peer_by_link.get(&it.number)?)))
+        {
             let is_same = peer.identity.incarnation == incarnation;
             let list = match (this.proved, peer.proved) {
                 (Some(proved), Some(other)) if proved != other && is_same => {
@@ -1171,7 +1175,7 @@ impl Registry {
             .entry(peer.identity.incarnation)
             .or_default();
         known.push(link.clone());
-        self.peers.insert(link.number, peer);
+        self.peer_by_link.insert(link.number, peer);
         Ok(())
     }
 
