@@ -205,7 +205,12 @@ async fn send_all(
             last = left;
             draft.deadline = Duration::from_secs(60);
         }
-        under_way.push_back((number, draft, stops, send(&mts, stream, number, draft)));
+        under_way.push_back(SentLetter {
+            number,
+            draft,
+            is_last: stops,
+            sending: send(&mts, stream, number, draft),
+        });
         if under_way.len() >= WINDOW
             && let Some(oldest) = under_way.pop_front()
         {
@@ -228,13 +233,24 @@ fn send(mts: &fipa_mts::Mts, stream: usize, number: usize, draft: Draft) -> Send
     })
 }
 
-async fn note(
-    records: &StreamRecords,
-    stream: usize,
-    (number, draft, last, sending): (usize, Draft, bool, Sending),
-) {
+/// A letter without an outcome.
+struct SentLetter {
+    number: usize,
+    draft: Draft,
+    /// Whether it was sent after the last fault.
+    is_last: bool,
+    sending: Sending,
+}
+
+async fn note(records: &StreamRecords, stream: usize, sent: SentLetter) {
+    let SentLetter {
+        number,
+        draft,
+        is_last,
+        sending,
+    } = sent;
     let outcome = outcome(sending).await;
-    if last {
+    if is_last {
         let expected =
             outcome.is_success() != draft.refused && is_refusal(&outcome) == draft.refused;
         let retries = outcome.attempts().len();

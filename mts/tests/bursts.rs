@@ -130,6 +130,13 @@ struct Service {
     wake: Option<Instant>,
 }
 
+/// The indices of two services.
+#[derive(Debug, Clone, Copy)]
+struct Ends {
+    from: usize,
+    to: usize,
+}
+
 #[derive(Debug)]
 enum Event {
     Send {
@@ -288,7 +295,7 @@ impl Path {
                 to,
                 attempt,
                 parcel,
-            } => self.arrive((from, to), attempt, *parcel),
+            } => self.arrive(Ends { from, to }, attempt, *parcel),
             Event::Conclude {
                 at,
                 attempt,
@@ -335,7 +342,8 @@ impl Path {
         self.carry_out(SENDER);
     }
 
-    fn arrive(&mut self, (from, to): (usize, usize), attempt: AttemptId, parcel: Parcel) {
+    fn arrive(&mut self, ends: Ends, attempt: AttemptId, parcel: Parcel) {
+        let Ends { from, to } = ends;
         let kind = kind(from, to);
         let held = self.services[to].tickets.values();
         let held = held.filter(|(sender, _)| *sender == from).count();
@@ -356,9 +364,11 @@ impl Path {
         };
         let now = self.clocks();
         match self.services[to].core.handle_arrival(now, kind, arrival) {
-            Reaction::Now(answer) => {
-                self.conclude((to, from), attempt, Conclusion::Answered(answer))
-            }
+            Reaction::Now(answer) => self.conclude(
+                Ends { from: to, to: from },
+                attempt,
+                Conclusion::Answered(answer),
+            ),
             Reaction::Later => {
                 self.services[to].tickets.insert(ticket, (from, attempt));
             }
@@ -367,7 +377,8 @@ impl Path {
     }
 
     /// The end of an attempt travels back to its sender.
-    fn conclude(&mut self, (from, to): (usize, usize), attempt: AttemptId, conclusion: Conclusion) {
+    fn conclude(&mut self, ends: Ends, attempt: AttemptId, conclusion: Conclusion) {
+        let Ends { from, to } = ends;
         let at = self.now + travel(from, to);
         self.at(
             at,
@@ -422,7 +433,11 @@ impl Path {
                 }
                 Action::Answer { ticket, answer, .. } => {
                     let (from, attempt) = self.services[at].tickets.remove(&ticket).unwrap();
-                    self.conclude((at, from), attempt, Conclusion::Answered(answer));
+                    self.conclude(
+                        Ends { from: at, to: from },
+                        attempt,
+                        Conclusion::Answered(answer),
+                    );
                 }
                 Action::Outcome {
                     submission,

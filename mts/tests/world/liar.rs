@@ -19,7 +19,7 @@ use fipa_transport::{
     Kind, Mandate, Outcome, Parcel, Principal, Report, Stream, TransportError, TransportErrorKind,
 };
 
-use super::links::Flown;
+use super::links::{Ends, Flown};
 use super::view::{Registered, View, way};
 use super::{AGENTS, Breach, Event, PROCESSES, Process, Set, World};
 
@@ -247,7 +247,7 @@ impl World {
     /// A parcel arrives at a hostile member, which answers arbitrarily, or out of habit.
     pub(super) fn answer_falsely(
         &mut self,
-        (from, to): (usize, usize),
+        ends: Ends,
         kind: Kind,
         attempt: AttemptId,
         parcel: Parcel,
@@ -255,8 +255,9 @@ impl World {
         if let Body::Letter(_) = &parcel.body
             && let Some(habit) = self.habit()
         {
-            return self.answer_out_of_habit((from, to), kind, attempt, (parcel, habit));
+            return self.answer_out_of_habit(ends, kind, attempt, (parcel, habit));
         }
+        let from = ends.from;
         let answers = self.random.u32(..8);
         let answer = self.false_answer(parcel.sequence);
         let Some(liars) = &mut self.liars else { return };
@@ -315,11 +316,12 @@ impl World {
 
     fn answer_out_of_habit(
         &mut self,
-        (from, to): (usize, usize),
+        ends: Ends,
         kind: Kind,
         attempt: AttemptId,
         (parcel, habit): (Parcel, Habit),
     ) {
+        let Ends { from, to } = ends;
         let uncertain = false;
         let (conclusion, note) = match habit {
             Habit::Returned | Habit::Mixed => (Answer::Returned { uncertain }, None),
@@ -351,7 +353,12 @@ impl World {
             liars.attempts
         });
         let named = self.processes[to].incarnation;
-        let flown = Flown::lie((to, from), kind, (AttemptId(attempts), note), named);
+        let flown = Flown::lie(
+            Ends { from: to, to: from },
+            kind,
+            (AttemptId(attempts), note),
+            named,
+        );
         let arrives = self.now + Duration::from_millis(2);
         self.at(arrives, Event::Arrive(Box::new(flown)));
     }
@@ -700,7 +707,15 @@ impl World {
             liars.attempts
         });
         let attempt = AttemptId(attempts);
-        let flown = Flown::lie((liar, target), kind, (attempt, parcel), named);
+        let flown = Flown::lie(
+            Ends {
+                from: liar,
+                to: target,
+            },
+            kind,
+            (attempt, parcel),
+            named,
+        );
         self.after_ms(5, Event::Arrive(Box::new(flown)));
         Ok(())
     }

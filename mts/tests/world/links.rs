@@ -73,17 +73,24 @@ pub(super) struct Flown {
     named: Option<Incarnation>,
 }
 
+/// The indices of two processes.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Ends {
+    pub(super) from: usize,
+    pub(super) to: usize,
+}
+
 impl Flown {
     /// A parcel of a hostile member, on a link that claims this service.
     pub(super) fn lie(
-        (from, to): (usize, usize),
+        ends: Ends,
         kind: Kind,
         (attempt, parcel): (AttemptId, Parcel),
         named: Incarnation,
     ) -> Self {
         Self {
-            from,
-            to,
+            from: ends.from,
+            to: ends.to,
             kind,
             attempt,
             parcel,
@@ -195,7 +202,7 @@ impl World {
             self.fly(at, attempt, Some(self.now), Some(event));
             return self.fault_until(arrives);
         }
-        let (leaves, done, arrives) = self.transmit((at, to), kind, remote, size);
+        let (leaves, done, arrives) = self.transmit(Ends { from: at, to }, kind, remote, size);
         let event = self.at(arrives, arrive(parcel, false));
         self.fly(at, attempt, Some(leaves), Some(event));
         if let Some(flight) = self.processes[at].open.get_mut(&attempt) {
@@ -217,7 +224,7 @@ impl World {
     /// The times at which a parcel leaves its process, is transmitted, and arrives.
     fn transmit(
         &mut self,
-        (at, to): (usize, usize),
+        Ends { from: at, to }: Ends,
         kind: Kind,
         remote: bool,
         size: usize,
@@ -393,7 +400,7 @@ impl World {
         }
         if self.processes[to].hostile {
             if !copy {
-                self.answer_falsely((from, to), kind, attempt, parcel);
+                self.answer_falsely(Ends { from, to }, kind, attempt, parcel);
             }
             return Ok(());
         }
