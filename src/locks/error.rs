@@ -56,7 +56,7 @@ pub enum LockError {
     },
     /// This agent was told to use an algorithm, and the owner of the resource uses another one.
     #[error(
-        "the owner of {resource:?} uses the algorithm {owner}, and this agent was told to use {here}; use that of \
+        "the owner of {resource:?} uses the algorithm {owner}, and this agent was told to use {own}; use that of \
          the owner, or name none"
     )]
     OtherAlgorithm {
@@ -65,7 +65,7 @@ pub enum LockError {
         /// The algorithm of the owner.
         owner: Algorithm,
         /// The algorithm of this agent.
-        here: Algorithm,
+        own: Algorithm,
     },
     /// The lock was lost: its lease ended without a renewal, or the owner has ended it.
     #[error("the lock of {resource:?} was lost")]
@@ -122,7 +122,7 @@ impl LockError {
             Failure::Algorithm { owner, here } => Self::OtherAlgorithm {
                 resource,
                 owner,
-                here,
+                own: here,
             },
             Failure::Refused(reason) => Self::Refused { resource, reason },
             _ => Self::Lost { resource },
