@@ -155,8 +155,8 @@ fn commands_with_agents_of_their_own_go_on_after_an_illegal_message() {
     let changed = watching.line();
     assert!(changed.contains("lift-2"), "{changed}");
     crane.send_signal("-INT");
-    let left = watching.line();
-    assert!(left.contains("crane"), "{left}");
+    let line = watching.line();
+    assert!(line.contains("crane"), "{line}");
     drop(crane);
 }
 

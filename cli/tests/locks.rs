@@ -89,7 +89,7 @@ fn command(host: &Host, fence: &str) -> String {
 fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     let host = Host::new();
     let mut crane = own(&host, &["--lease", "10min"]);
-    let (holder, stale, left) = hold(&host, &["--agent", "rover"], HOLD);
+    let (holder, stale, orphan) = hold(&host, &["--agent", "rover"], HOLD);
     let (number, epoch, run) = parts(&stale);
     assert_eq!(number, "1");
     assert_eq!(crane.line(), format!("granted to rover, fence {stale}"));
@@ -113,7 +113,7 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     assert_eq!(crane.line(), format!("ended with rover, fence {stale}"));
     assert_eq!(crane.line(), format!("granted to arm, fence {fence}"));
     // The command of the killed holder goes on, and its fence is refused.
-    assert!(left.is_running());
+    assert!(orphan.is_running());
     assert_eq!(command(&host, &stale), "refuse");
     let refused = format!("refused: the fence {stale}");
     assert!(crane.line().starts_with(&refused));

@@ -117,7 +117,7 @@ fn services_of_another_host_are_found_and_watched_until_they_end() {
     let mut watching = near.start(&["df", "watch", "--type", "lifting", "--json"]);
     let crane =
         |service: &str| far.start(&["df", "register", "crane", "lifting", "--service", service]);
-    let left = json!({ "event": "left", "name": "crane" });
+    let departure = json!({ "event": "left", "name": "crane" });
     for (service, signal) in [("lift-1", "-INT"), ("lift-2", "-KILL")] {
         let crane = crane(service);
         let changed = next_json(&mut watching);
@@ -128,14 +128,14 @@ fn services_of_another_host_are_found_and_watched_until_they_end() {
         assert_eq!(found["df"], "df@near");
         assert_eq!(found["agents"], json!([changed["agent"]]));
         crane.signal(signal);
-        assert_eq!(next_json(&mut watching), left);
+        assert_eq!(next_json(&mut watching), departure);
         let found = near.run(&["df", "search", "--json"]).done_json();
         assert_eq!(found["agents"], json!([]));
     }
     let _crane = crane("lift-3");
     assert_eq!(next_json(&mut watching)["event"], "changed");
     gateway.signal("-KILL");
-    assert_eq!(next_json(&mut watching), left);
+    assert_eq!(next_json(&mut watching), departure);
     let found = near.run(&["df", "search", "--json"]).done_json();
     assert_eq!(found["agents"], json!([]));
 }

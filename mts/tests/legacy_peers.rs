@@ -150,12 +150,12 @@ fn the_sender_of_an_undeliverable_recorded_letter_gets_a_failure_message_in_its_
         assert_eq!(message.ontology(), Some("fipa-agent-management"));
         assert_eq!(message.in_reply_to(), Some("rw-1"));
         assert_eq!(message.conversation_id(), Some("conv-1"));
-        let told = nested(message.content().unwrap());
-        assert_eq!(*told.performative(), Performative::Inform);
-        assert_eq!(told.sender().unwrap().name(), "cpp-sender");
-        assert_eq!(told.receivers().len(), 1);
-        assert_eq!(told.language(), Some("internal-error"));
-        let text = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+        let reported = nested(message.content().unwrap());
+        assert_eq!(*reported.performative(), Performative::Inform);
+        assert_eq!(reported.sender().unwrap().name(), "cpp-sender");
+        assert_eq!(reported.receivers().len(), 1);
+        assert_eq!(reported.language(), Some("internal-error"));
+        let text = String::from_utf8(reported.content().unwrap().to_vec()).unwrap();
         assert!(
             text.starts_with("description: message delivery failed"),
             "{text}"
@@ -163,8 +163,8 @@ fn the_sender_of_an_undeliverable_recorded_letter_gets_a_failure_message_in_its_
         assert!(text.contains("\ndelivery path: send-mts,"), "{text}");
     }
     assert_eq!(ours.sender().unwrap().name(), "gateway");
-    let told = nested(ours.content().unwrap());
-    assert_eq!(told.receivers()[0].name(), "echo");
+    let reported = nested(ours.content().unwrap());
+    assert_eq!(reported.receivers()[0].name(), "echo");
     let written = ours.encode(Representation::BitEfficient, Dialect::FipaServices);
     written.unwrap();
 
@@ -199,13 +199,13 @@ fn each_failed_receiver_is_reported_once_and_failed_failure_messages_never() {
         deadline,
         &mut read(&core, letter(Performative::Request), Kind::Tcp, HERE),
     );
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     while let Some((_, location, parcel)) = dispatched(&mut core) {
         assert_eq!(location.to_string(), OLD_PEER);
         let content = message_of(&parcel).content().unwrap().clone();
-        told.push(nested(&content).receivers()[0].name().to_owned());
+        reported.push(nested(&content).receivers()[0].name().to_owned());
     }
-    assert_eq!(told, ["absent", "absent-else"]);
+    assert_eq!(reported, ["absent", "absent-else"]);
     core.handle_unframed(
         now(),
         deadline,
@@ -260,21 +260,21 @@ fn a_refused_sender_gets_failure_messages_in_its_dialect_at_a_limited_rate() {
             &mut read(&core, recorded(LETTER), Kind::Tcp, HERE),
         );
     }
-    let mut told = 0;
+    let mut reported = 0;
     while let Some((attempt, location, parcel)) = dispatched(&mut core) {
-        told += 1;
+        reported += 1;
         assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
         let message = message_of(&parcel);
         assert_eq!(*message.performative(), Performative::Failure);
         assert_eq!(message.receivers()[0].name(), "cpp-sender");
         assert_eq!(message.in_reply_to(), Some("rw-1"));
-        let told = nested(message.content().unwrap());
-        assert_eq!(told.receivers()[0].name(), "echo");
-        let text = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+        let reported = nested(message.content().unwrap());
+        assert_eq!(reported.receivers()[0].name(), "echo");
+        let text = String::from_utf8(reported.content().unwrap().to_vec()).unwrap();
         assert!(text.contains("refused"), "{text}");
         core.handle_conclusion(then, attempt, Conclusion::Handed);
     }
-    assert_eq!(told, 20, "the limit per second");
+    assert_eq!(reported, 20, "the limit per second");
 }
 
 /// The agents that became contacts, and their locations.
@@ -437,9 +437,9 @@ fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_gets_a_failure_message
     let failure = message_of(&parcel);
     assert_eq!(*failure.performative(), Performative::Failure);
     assert_eq!(failure.receivers()[0].name(), "cpp-sender");
-    let told = nested(failure.content().unwrap());
-    assert_eq!(told.receivers()[0].name(), "echo");
-    let text = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+    let reported = nested(failure.content().unwrap());
+    assert_eq!(reported.receivers()[0].name(), "echo");
+    let text = String::from_utf8(reported.content().unwrap().to_vec()).unwrap();
     let expected = "description: message delivery failed: refused: the message cannot be decoded: ";
     assert!(text.starts_with(expected), "{text}");
     assert_eq!(text.lines().count(), 2, "{text}");
@@ -482,8 +482,8 @@ fn the_sender_of_a_framed_letter_that_cannot_be_decoded_gets_a_failure_message()
     assert_eq!(&*parcel.receiver, "rover");
     let failure = message_of(&parcel);
     assert_eq!(*failure.performative(), Performative::Failure);
-    let told = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
-    assert!(told.contains("refused: the message cannot be decoded: for a test"));
+    let reported = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
+    assert!(reported.contains("refused: the message cannot be decoded: for a test"));
 
     // A letter of another agent under this name causes no failure message.
     let other = received(Incarnation::from_u64(66));
@@ -580,7 +580,7 @@ fn a_sender_whose_letters_all_fail_does_not_use_up_the_limit_of_another() {
         letter_for(&message, now().utc).unwrap()
     };
     let then = now();
-    let told = |core: &mut Core, name: &str| {
+    let reported = |core: &mut Core, name: &str| {
         let mut unframed = read(core, letter_of(name), Kind::Tcp, HERE);
         core.handle_unframed(then, deadline, &mut unframed);
         dispatched(core).is_some_and(|(attempt, _, parcel)| {
@@ -589,9 +589,9 @@ fn a_sender_whose_letters_all_fail_does_not_use_up_the_limit_of_another() {
             true
         })
     };
-    let loud = (0..200).filter(|_| told(&mut core, "loud")).count();
+    let loud = (0..200).filter(|_| reported(&mut core, "loud")).count();
     assert_eq!(loud, 20);
-    assert!(told(&mut core, "quiet"));
+    assert!(reported(&mut core, "quiet"));
 }
 
 /// The receivers that failure messages name after a letter to these receivers.
@@ -605,12 +605,12 @@ fn told_of(core: &mut Core, receivers: &[String]) -> Vec<String> {
     while !unframed.is_handled() {
         core.handle_unframed(now(), Duration::from_secs(5), &mut unframed);
     }
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     while let Some((_, _, parcel)) = dispatched(core) {
         let content = message_of(&parcel).content().unwrap().clone();
-        told.push(nested(&content).receivers()[0].name().to_owned());
+        reported.push(nested(&content).receivers()[0].name().to_owned());
     }
-    told
+    reported
 }
 
 #[test]
@@ -630,8 +630,8 @@ fn a_letter_to_too_many_receivers_or_patterns_is_refused_as_a_whole() {
     // An allowed letter reaches its receivers. The sender gets failure messages about the others,
     // but no more bytes than it has sent.
     let mut core = core(true, &[("old", OLD_PEER), ("other.x", OLD_PEER)]);
-    let told = told_of(&mut core, &names(64));
-    assert!((1..10).contains(&told.len()), "{told:?}");
+    let reported = told_of(&mut core, &names(64));
+    assert!((1..10).contains(&reported.len()), "{reported:?}");
 }
 
 #[test]
@@ -741,10 +741,10 @@ fn letters_to_an_unreachable_legacy_peer_fail_like_others() {
         other => panic!("{other:?}"),
     }
     // The agent gets a failure message in its own process, in FIPA SL.
-    let told = core.take(rover).unwrap();
-    let told = Message::decode(told.letter.payload()).unwrap();
-    assert_eq!(*told.performative(), Performative::Failure);
-    assert_eq!(told.language(), Some("fipa-sl"));
+    let reported = core.take(rover).unwrap();
+    let reported = Message::decode(reported.letter.payload()).unwrap();
+    assert_eq!(*reported.performative(), Performative::Failure);
+    assert_eq!(reported.language(), Some("fipa-sl"));
 }
 
 /// Parses the letter for this core.

@@ -464,8 +464,8 @@ fn leases_are_capped_and_end() {
     it.call(20.0, &asker("e", OTHER), &renew).unwrap();
     assert_eq!(it.names(hour, &all_lifting()), ["a", "b", "e"]);
     it.df.handle_timeout(it.clock.after(hour + 20.0).at);
-    let left: Vec<_> = it.df.descriptions().cloned().collect();
-    assert_eq!(names(&left), ["a", "b"]);
+    let remaining: Vec<_> = it.df.descriptions().cloned().collect();
+    assert_eq!(names(&remaining), ["a", "b"]);
     assert_eq!(it.df.poll_timeout(), Some(it.clock.after(9.0 * hour).at));
     // Relative times become absolute.
     let relative = Time::after(Duration::from_secs(30)).unwrap();

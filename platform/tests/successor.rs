@@ -111,9 +111,9 @@ fn descriptions_come_back_with_their_leases() {
     let mut next = successor(&file, 20.0, |_| true);
     assert!(next.df.descriptions().eq(&before));
     // The order of registration, which decides what travels to other hosts.
-    let told = next.df.poll_local().unwrap();
-    let told: Vec<&str> = told.iter().map(|it| &*it.name).collect();
-    assert_eq!(told, ["zebra", "crane", "leased"]);
+    let announced = next.df.poll_local().unwrap();
+    let announced: Vec<&str> = announced.iter().map(|it| &*it.name).collect();
+    assert_eq!(announced, ["zebra", "crane", "leased"]);
     // 60 seconds, of which 30 have passed.
     assert_eq!(next.names(29.0, &all_lifting()).len(), 5);
     assert_eq!(next.names(31.0, &all_lifting()).len(), 4);
@@ -187,13 +187,13 @@ fn after_too_many_changes_all_that_match_are_told_again() {
         it.register(&local(&format!("crane-{number}"))).unwrap();
     }
     let mut next = successor(&stored(&it, 0.0), 1.0, |_| true);
-    let mut told = 0;
+    let mut announced = 0;
     let mut seconds = 0.0;
     while let Some((_, found)) = notification(&mut next, seconds) {
-        told += found.len();
+        announced += found.len();
         seconds += 1.0;
     }
-    assert_eq!(told, 300);
+    assert_eq!(announced, 300);
 }
 
 #[test]

@@ -168,7 +168,7 @@ fn fill_and_empty(stop: &AtomicBool, mut rng: Rng) -> u64 {
     let mut filled = 0;
     while !stop.load(Ordering::SeqCst) {
         let file = File::create(path).unwrap();
-        let left = match rng.u8(..3) {
+        let pages_left = match rng.u8(..3) {
             0 => 0,
             1 => rng.u64(..16),
             _ => rng.u64(..512),
@@ -176,9 +176,9 @@ fn fill_and_empty(stop: &AtomicBool, mut rng: Rng) -> u64 {
         // Concurrent allocations of other processes change the result by a little.
         let mut taken = 0;
         while let free = statvfs("/dev/shm").unwrap().f_bavail
-            && free > left
+            && free > pages_left
         {
-            let more = (free - left) * PAGE;
+            let more = (free - pages_left) * PAGE;
             if fallocate(&file, FallocateFlags::empty(), taken, more).is_ok() {
                 taken += more;
             }

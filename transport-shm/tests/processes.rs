@@ -563,9 +563,9 @@ fn clean_without_descriptors(config: &ShmConfig) {
             drop(std::fs::File::open("/dev/null"));
         }
     });
-    for left in 0..200 {
+    for more in 0..200 {
         let limit = Rlimit {
-            current: Some(free + left % 10),
+            current: Some(free + more % 10),
             ..limits
         };
         setrlimit(Resource::Nofile, limit).unwrap();

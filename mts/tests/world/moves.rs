@@ -108,7 +108,7 @@ impl World {
                 continue;
             }
             let all = self.view(at).entries();
-            let left = all.iter().filter(|entry| match entry.reach {
+            let unlisted = all.iter().filter(|entry| match entry.reach {
                 Reach::Remote { gateway } => {
                     ended.contains(&gateway) && entry.incarnation != gateway
                 }
@@ -120,7 +120,8 @@ impl World {
                 })
             };
             late.extend(
-                left.filter(|entry| !is_told(entry))
+                unlisted
+                    .filter(|entry| !is_told(entry))
                     .map(|it| (at, Arc::clone(it))),
             );
         }

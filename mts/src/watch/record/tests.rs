@@ -100,9 +100,11 @@ fn records_survive_a_round_trip() {
                 RecordBody::Settled {
                     outcome, sender, ..
                 },
-                News::Settled { outcome: told, .. },
+                News::Settled {
+                    outcome: settled, ..
+                },
             ) => {
-                assert_eq!((outcome, sender), (told, true));
+                assert_eq!((outcome, sender), (settled, true));
             }
             (body, news) => panic!("{news:?} was read as {body:?}"),
         }
