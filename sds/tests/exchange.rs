@@ -145,7 +145,7 @@ impl World {
             name: name.into(),
             incarnation: gateway.agents[name].incarnation,
             text: text.into(),
-            lease: lease.map(|removed| self.now + removed),
+            lease: lease.map(|time_left| self.now + time_left),
         };
         gateway.df.insert(name.to_owned(), entry);
         self.update_df(index);
@@ -407,12 +407,15 @@ fn df_entries_are_renewed_before_they_end() {
     for _ in 0..50 {
         world.run(hour / 10);
         for entry in world.gateways[1].exchange.directory().df_entries() {
-            let removed = entry.ends.saturating_duration_since(world.now);
+            let time_left = entry.ends.saturating_duration_since(world.now);
             match &*entry.name {
                 // Its lease is not renewed; the directory facilitator there removes it.
-                "rover" => assert!(removed.is_zero()),
+                "rover" => assert!(time_left.is_zero()),
                 name => {
-                    assert!(removed > hour / 2 && removed <= hour, "{name}: {removed:?}");
+                    assert!(
+                        time_left > hour / 2 && time_left <= hour,
+                        "{name}: {time_left:?}"
+                    );
                     assert_eq!(entry.has_lease, name == "arm");
                 }
             }
@@ -693,13 +696,13 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let at = location(0).with_incarnation(new);
     let known = Present::unproved(world.gateways[0].mts.clone(), vec![location(0)]);
     let restarted = Present::unproved(MtsId::new("same-name-mts", new), vec![at]);
-    let handle = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,"agents":
+    let letter = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,"agents":
         [{"name":"arm","type":"arm","id":"00000000000003e9","registered":1001}]}}}"#;
     let now = world.now;
     let exchange = &mut world.gateways[1].exchange;
     // A connection with the old one appears open: its entries stay.
     exchange.handle_neighbors(now, &[known, restarted.clone()]);
-    exchange.handle_letter(now, new, handle).unwrap();
+    exchange.handle_letter(now, new, letter).unwrap();
     assert!(directory.speaks_for(old));
     // It ends: its entries leave at once, and those of the new one are there.
     exchange.handle_neighbors(now, std::slice::from_ref(&restarted));
@@ -714,7 +717,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     exchange.handle_neighbors(now, &[]);
     exchange.handle_neighbors(now, std::slice::from_ref(&started_again));
     assert_eq!(gateway(), Some(new));
-    exchange.handle_letter(now, newer, handle).unwrap();
+    exchange.handle_letter(now, newer, letter).unwrap();
     assert_eq!(gateway(), Some(newer));
     assert!(!directory.speaks_for(new));
 
@@ -733,7 +736,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
         Some(newer),
         "no other gateway has sent its agents"
     );
-    exchange.handle_letter(now, newest, handle).unwrap();
+    exchange.handle_letter(now, newest, letter).unwrap();
     assert!(exchange.handle_silence(now, &silent));
     assert!(!directory.speaks_for(newer));
     assert_eq!(gateway(), Some(newest));
@@ -795,10 +798,10 @@ fn gateways_that_never_become_neighbors_keep_no_others_from_being_asked() {
     let again = br#"{"version":1,"tell":"again"}"#;
     for stranger in 0..10_000 {
         let stranger = Incarnation::from_u64(1_000_000 + stranger);
-        let handle = world.gateways[1]
+        let result = world.gateways[1]
             .exchange
             .handle_letter(now, stranger, again);
-        assert!(matches!(handle, Err(ExchangeError::NotConnected)));
+        assert!(matches!(result, Err(ExchangeError::NotConnected)));
     }
     let present = [Present::unproved(
         world.gateways[1].mts.clone(),
@@ -837,16 +840,16 @@ fn the_agents_of_a_gateway_are_bounded_also_by_changes() {
             .map(|it| format!(r#""agent_{it}""#))
             .collect();
         let (joined, removed, next) = (joined.join(","), removed.join(","), version + 1);
-        let handle = tell(
+        let result = tell(
             exchange,
             format!(
-                r#"{{"version":1,"tell":{{"changes":{{"from":{version},"to":{next},"agents":[{joined}],"removed":[{removed}]}}}}}}"#
+                r#"{{"version":1,"tell":{{"changes":{{"from":{version},"to":{next},"agents":[{joined}],"left":[{removed}]}}}}}}"#
             ),
         );
-        if handle.is_ok() {
+        if result.is_ok() {
             version = next;
         }
-        handle
+        result
     };
     let all: Vec<usize> = (0..Exchange::MAX_AGENTS).collect();
     for part in all.chunks(1000) {
@@ -1672,7 +1675,7 @@ impl HostileLoad {
     fn lie(&mut self) {
         let at = self.honest();
         self.version += 1;
-        let handle = match self.world.random.u32(..8) {
+        let part = match self.world.random.u32(..8) {
             0 => serde_json::json!("goodbye"),
             1 => serde_json::json!("again"),
             how => {
@@ -1688,7 +1691,7 @@ impl HostileLoad {
                 }
             }
         };
-        let content = serde_json::json!({ "version": 1, "tell": handle }).to_string();
+        let content = serde_json::json!({ "version": 1, "tell": part }).to_string();
         let from = self.world.gateways[self.liar].mts.incarnation;
         let now = self.world.now;
         let taken = self.world.gateways[at]
