@@ -7,7 +7,7 @@ use std::time::SystemTime;
 use fipa_acl::{AgentId, Message, MessageView, Performative};
 use smallvec::{Array, SmallVec};
 
-use crate::act::{Act, FAILURE};
+use crate::protocol::act::{Act, FAILURE};
 
 /// The parameters of a message that determine whether it fits its conversation.
 ///

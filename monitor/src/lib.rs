@@ -17,41 +17,29 @@
 //!
 //! Files and messages may be hostile: every size has a bound, and [`MonitorLimits`] bounds the memory.
 
-mod act;
-mod change;
+mod check;
 mod clock;
 mod conversation;
-mod deadlines;
-mod delegated;
-mod fingerprints;
 mod header;
-mod index;
-mod judge;
-mod library;
 mod limits;
-mod machine;
-mod memory;
 mod monitor;
-mod names;
-mod parties;
 mod policy;
-pub mod projection;
+mod protocol;
 pub mod recording;
-mod report;
-mod roles;
-pub mod scxml;
 mod snapshot;
-mod table;
 mod verdict;
 
-pub use act::near_standard;
 pub use clock::Moment;
 pub use header::Header;
-pub use library::{Library, LibraryError, LibraryFull};
 pub use limits::MonitorLimits;
-pub use machine::{After, Cancel, Machine, Scope, State, Subprotocol, Timeout, Transition};
 pub use monitor::{Event, Monitor};
 pub use policy::{History, MonitorPolicy, one_edit_apart};
+pub use protocol::act::near_standard;
+pub use protocol::library::{Library, LibraryError, LibraryFull};
+pub use protocol::machine::{
+    After, Cancel, Machine, Scope, State, Subprotocol, Timeout, Transition,
+};
+pub use protocol::{projection, scxml};
 pub use snapshot::SnapshotError;
 pub use verdict::{
     Accepted, Expected, ReplyMismatch, Unchecked, Verdict, Violation, ViolationKind,

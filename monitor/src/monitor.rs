@@ -7,23 +7,23 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use smallvec::SmallVec;
 
-use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
-use crate::change::{Change, expire, expire_party};
+use crate::check::apply::{Change, expire, expire_party};
+use crate::check::judge::{Fault, Move, MoveTarget, ObservedMessage, judge, unbound};
+use crate::check::report::violation;
+use crate::check::roles::take_back_local;
 use crate::clock::span_millis;
+use crate::conversation::deadlines::{Deadline, Deadlines};
+use crate::conversation::fingerprints::Fingerprints;
+use crate::conversation::memory::{Refused, Removed};
+use crate::conversation::names::{Name, Names};
+use crate::conversation::table::{List, Slot, Table};
 use crate::conversation::{
     CANCELLED, CANCELLING, Conversation, Copied, FAILED, Holders, NONE, NextState, Party,
     RoleBinding, Side, act_number, is_final, is_over, state_name,
 };
-use crate::deadlines::{Deadline, Deadlines};
-use crate::fingerprints::Fingerprints;
-use crate::judge::{Fault, Move, MoveTarget, ObservedMessage, judge, unbound};
 use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
-use crate::machine::{Machine, Scope, step};
-use crate::memory::{Refused, Removed};
-use crate::names::{Name, Names};
-use crate::report::violation;
-use crate::roles::take_back_local;
-use crate::table::{List, Slot, Table};
+use crate::protocol::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+use crate::protocol::machine::{Machine, Scope, step};
 use crate::verdict::{Accepted, Unchecked, Verdict, ViolationKind as Kind};
 use crate::{Header, History, Library, Moment, MonitorLimits, MonitorPolicy};
 
@@ -1691,8 +1691,8 @@ mod tests {
     use fipa_acl::{Performative, Time};
 
     use super::*;
+    use crate::conversation::names::COMPARISONS;
     use crate::conversation::{Details, Rare};
-    use crate::names::COMPARISONS;
 
     #[test]
     fn stale_deadlines_are_removed() {

@@ -26,16 +26,16 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};
 
-use crate::act::Act;
+use crate::conversation::deadlines::Deadline;
+use crate::conversation::names::{Name, Names};
 use crate::conversation::{
     AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, EARLIER, FAILED, NONE, Party, RoleBinding, Side,
     Tail,
 };
-use crate::deadlines::Deadline;
 use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
-use crate::machine::{Machine, Scope};
 use crate::monitor::Monitor;
-use crate::names::{Name, Names};
+use crate::protocol::act::Act;
+use crate::protocol::machine::{Machine, Scope};
 use crate::{Library, Moment, MonitorLimits};
 
 const MAGIC: [u8; 8] = *b"fipa-cnv";

@@ -3,15 +3,15 @@
 
 use std::sync::Arc;
 
-use crate::act::{CANCEL, FAILURE, NOT_UNDERSTOOD};
+use crate::check::judge::{Fault, ObservedMessage, unbound};
+use crate::conversation::names::Names;
 use crate::conversation::{
     AFTER_NOT_UNDERSTOOD, Conversation, LastSent, NONE, Party, RoleBinding, act_number,
 };
-use crate::judge::{Fault, ObservedMessage, unbound};
-use crate::machine::Machine;
 use crate::monitor::{Denied, Monitor, Passed};
-use crate::names::Names;
-use crate::projection::{LocalRun, NotLocal, Observed, Projection};
+use crate::protocol::act::{CANCEL, FAILURE, NOT_UNDERSTOOD};
+use crate::protocol::machine::Machine;
+use crate::protocol::projection::{LocalRun, NotLocal, Observed, Projection};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 use crate::{Header, Moment};
 

@@ -3,19 +3,27 @@
 //! With [`Scope::Participant`], each participant has a [`Party`] with a state of its own. With
 //! [`Scope::Conversation`], there is one party without a participant, and a list of role bindings.
 
+pub(crate) mod deadlines;
+pub(crate) mod fingerprints;
+mod index;
+pub(crate) mod memory;
+pub(crate) mod names;
+mod parties;
+pub(crate) mod table;
+
 use std::ops::{Deref, Range};
 
 use fipa_acl::Performative;
 use hashbrown::HashTable;
 use smallvec::SmallVec;
 
-use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+use crate::conversation::names::{Name, Names};
+use crate::conversation::parties::Parties;
+use crate::conversation::table::spread;
 use crate::limits::MAX_DESIGNATED;
-use crate::machine::{Cancel, Guard, Machine, Roles, Scope, State, Transition, step};
-use crate::names::{Name, Names};
-use crate::parties::Parties;
-use crate::projection::LocalRun;
-use crate::table::spread;
+use crate::protocol::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+use crate::protocol::machine::{Cancel, Guard, Machine, Roles, Scope, State, Transition, step};
+use crate::protocol::projection::LocalRun;
 use crate::verdict::ViolationKind as Kind;
 
 /// The absence of a name or an index.
@@ -29,7 +37,7 @@ pub(crate) const CANCELLING: u16 = u16::MAX - 1;
 pub(crate) const CANCELLED: u16 = u16::MAX - 2;
 /// State of every protocol after the message transport service reported a failure.
 pub(crate) const FAILED: u16 = u16::MAX - 3;
-/// State that the monitor does not know: see [`crate::delegated`].
+/// State that the monitor does not know: see [`crate::check::delegated`].
 pub(crate) const ELSEWHERE: u16 = u16::MAX - 4;
 
 /// Returns the name of a state.
@@ -78,7 +86,7 @@ impl Side {
 }
 
 /// The state of a conversation with one participant or with all of them. It fits into one cache line: see
-/// [`Slot`](crate::table::Slot).
+/// [`Slot`](crate::conversation::table::Slot).
 #[derive(Debug, Clone)]
 #[repr(C)]
 pub(crate) struct Party {
@@ -491,7 +499,7 @@ impl Deref for Bound {
     }
 }
 
-/// The order of the fields is that of the memory: see [`Slot`](crate::table::Slot).
+/// The order of the fields is that of the memory: see [`Slot`](crate::conversation::table::Slot).
 #[derive(Debug)]
 #[repr(C)]
 pub(crate) struct Conversation {
@@ -1560,7 +1568,7 @@ mod tests {
     #[test]
     fn a_party_is_found_among_few_and_many() {
         let mut names = Names::new(std::hash::RandomState::new());
-        let mut table = crate::table::Table::new(&std::hash::RandomState::new());
+        let mut table = super::table::Table::new(&std::hash::RandomState::new());
         let at = table.insert("c", NONE, NONE, 0, 1);
         let conversation = &mut table.slot_mut(at).unwrap().conversation;
         for number in 0..40 {

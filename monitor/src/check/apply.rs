@@ -1,14 +1,14 @@
 //! Changes of a conversation by an accepted message or by a timeout.
 
 use crate::Header;
+use crate::check::judge::{Move, MoveTarget, ObservedMessage, unbound};
 use crate::clock::span_millis;
+use crate::conversation::deadlines::{Deadline, Deadlines};
+use crate::conversation::names::Names;
 use crate::conversation::{
     CANCELLING, Conversation, FAILED, NONE, Party, RoleBinding, Side, act_number, side_index,
 };
-use crate::deadlines::{Deadline, Deadlines};
-use crate::judge::{Move, MoveTarget, ObservedMessage, unbound};
-use crate::machine::{After, Machine, Scope};
-use crate::names::Names;
+use crate::protocol::machine::{After, Machine, Scope};
 
 /// Applies the timeouts that are due.
 pub(crate) fn expire(machine: &Machine, conversation: &mut Conversation, now: u64) {

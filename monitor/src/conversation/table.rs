@@ -8,9 +8,9 @@ use std::hash::{BuildHasher, RandomState};
 use hashbrown::HashTable;
 use siphasher::sip128::SipHasher13;
 
+use crate::conversation::index::Index;
+use crate::conversation::names::Name;
 use crate::conversation::{Conversation, NONE};
-use crate::index::Index;
-use crate::names::Name;
 
 /// A list of conversations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

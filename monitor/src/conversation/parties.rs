@@ -5,7 +5,7 @@ use std::ops::{Deref, DerefMut};
 use crate::conversation::{Details, Party};
 
 /// The parties of a conversation. A single one needs no allocation, and is in the cache line after the other
-/// fields: see [`Slot`](crate::table::Slot).
+/// fields: see [`Slot`](crate::conversation::table::Slot).
 #[derive(Debug)]
 pub(crate) enum Parties {
     /// No party, and a buffer for the next one.

@@ -1,8 +1,8 @@
 //! The projection onto one role, and a conversation that runs it.
 
 use super::{Label, Performed};
-use crate::act::Act;
-use crate::machine::Machine;
+use crate::protocol::act::Act;
+use crate::protocol::machine::Machine;
 
 /// A protocol as one role sees it.
 #[derive(Debug, Clone)]

@@ -2,7 +2,7 @@
 
 use crate::Machine;
 use crate::policy::one_edit_apart;
-use crate::scxml::ScxmlError;
+use crate::protocol::scxml::ScxmlError;
 
 /// Maximum number of protocols in a library.
 const MAX_MACHINES: usize = 256;
@@ -11,7 +11,7 @@ macro_rules! standard {
     ($name:literal) => {
         (
             concat!($name, ".scxml"),
-            include_str!(concat!("../protocols/", $name, ".scxml")),
+            include_str!(concat!("../../protocols/", $name, ".scxml")),
         )
     };
 }

@@ -1,13 +1,13 @@
-//! Protocols as checked state machines. [`crate::scxml`] reads them.
+//! Protocols as checked state machines. [`crate::protocol::scxml`] reads them.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::Pattern;
 
-use crate::act::{Act, Acts, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+use crate::protocol::act::{Act, Acts, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 
-use crate::projection::Projection;
+use crate::protocol::projection::Projection;
 
 /// Maximum number of roles of a protocol.
 pub(crate) const MAX_ROLES: usize = 32;
@@ -180,7 +180,7 @@ impl Machine {
     }
 
     /// The protocol as each role sees it, if it has three or more roles: see
-    /// [`projection`](crate::projection). `None` if it has two roles, which see all messages, or if
+    /// [`projection`](crate::protocol::projection). `None` if it has two roles, which see all messages, or if
     /// it cannot be projected. [`Projection::defects`] has the reasons.
     #[must_use]
     pub fn projection(&self) -> Option<&Projection> {

@@ -37,8 +37,8 @@ mod local;
 
 use std::collections::{BTreeSet, HashMap};
 
-use crate::act::{Act, Acts};
-use crate::machine::{Machine, Roles, Scope, State, Transition};
+use crate::protocol::act::{Act, Acts};
+use crate::protocol::machine::{Machine, Roles, Scope, State, Transition};
 
 pub use local::{Local, LocalState, LocalStep};
 pub(crate) use local::{LocalRun, NotLocal, Observed};
@@ -286,7 +286,7 @@ fn performed(acts: &Acts) -> Option<Vec<Performed>> {
         return Some(standard);
     }
     let text = acts.text();
-    crate::act::is_word(text).then(|| vec![Performed::Other(text.to_owned())])
+    crate::protocol::act::is_word(text).then(|| vec![Performed::Other(text.to_owned())])
 }
 
 /// Finds the states in which several roles decide.

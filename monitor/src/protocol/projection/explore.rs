@@ -3,7 +3,7 @@
 use std::collections::{HashSet, VecDeque};
 
 use super::{Defect, Local, LocalState, Performed, Projection, role_name};
-use crate::machine::Machine;
+use crate::protocol::machine::Machine;
 
 /// Maximum number of messages that wait between two roles.
 const QUEUE: usize = 2;

@@ -15,12 +15,12 @@
 
 use std::sync::Arc;
 
-use crate::act::{Act, FAILURE, INFORM};
+use crate::check::judge::ObservedMessage;
+use crate::conversation::names::Names;
 use crate::conversation::{ELSEWHERE, NONE, Party, Side, act_number, side_index};
-use crate::judge::ObservedMessage;
-use crate::machine::{Cancel, Machine, Scope, step};
 use crate::monitor::{Denied, Monitor};
-use crate::names::Names;
+use crate::protocol::act::{Act, FAILURE, INFORM};
+use crate::protocol::machine::{Cancel, Machine, Scope, step};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 use crate::{Header, Moment};
 
@@ -146,7 +146,7 @@ impl Monitor {
             Scope::Conversation => (conversation.parties.len().checked_sub(1), ELSEWHERE),
         };
         let added = conversation.growth(1, 0, 0) + Names::cost(observed.sender.len());
-        let grown = crate::table::Slot::COST + conversation.allocated() + added;
+        let grown = crate::conversation::table::Slot::COST + conversation.allocated() + added;
         let peer = match known.and_then(|known| conversation.parties.get(known)) {
             Some(party) => party.peer,
             None if conversation.parties.len() == self.limits.participants => return,

@@ -6,13 +6,13 @@ use std::collections::HashMap;
 
 use fipa_acl::is_pattern;
 
-use crate::act::{Act, FAILURE, INFORM};
+use crate::conversation::names::{Name, Names};
 use crate::conversation::{
     AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, Conversation, ELSEWHERE, FAILED, NONE, NextState,
     Party, PartyMessage, Side, next_state, side_index,
 };
-use crate::machine::{Cancel, Guard, Machine, Scope, step};
-use crate::names::{Name, Names};
+use crate::protocol::act::{Act, FAILURE, INFORM};
+use crate::protocol::machine::{Cancel, Guard, Machine, Scope, step};
 use crate::verdict::ViolationKind as Kind;
 
 /// A message with the values that every check of it needs.

@@ -1,11 +1,11 @@
 //! Descriptions of violations: the message, the state of the conversation, the expected messages.
 
+use crate::check::judge::Fault;
+use crate::conversation::names::Names;
+use crate::conversation::table::Table;
 use crate::conversation::{CANCELLING, Conversation, FAILED, Party, Tail, state_name};
-use crate::judge::Fault;
-use crate::machine::{Machine, Roles, Scope, State};
 use crate::monitor::Denied;
-use crate::names::Names;
-use crate::table::Table;
+use crate::protocol::machine::{Machine, Roles, Scope, State};
 use crate::verdict::{Expected, ReplyMismatch, Violation, ViolationKind as Kind};
 use crate::{Header, Library};
 
