@@ -33,12 +33,13 @@ pub use clock::Moment;
 pub use header::Header;
 pub use limits::MonitorLimits;
 pub use monitor::{Event, Monitor};
-pub use policy::{History, MonitorPolicy, one_edit_apart};
+pub use policy::{History, MonitorPolicy};
 pub use protocol::act::near_standard;
 pub use protocol::library::{Library, LibraryError, LibraryFull};
 pub use protocol::machine::{
     After, Cancel, Machine, Scope, State, Subprotocol, Timeout, Transition,
 };
+pub use protocol::spelling::one_edit_apart;
 pub use protocol::{projection, scxml};
 pub use snapshot::SnapshotError;
 pub use verdict::{

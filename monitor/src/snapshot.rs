@@ -26,12 +26,12 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};
 
+use crate::conversation::NONE;
+use crate::conversation::bindings::RoleBinding;
 use crate::conversation::deadlines::Deadline;
 use crate::conversation::names::{Name, Names};
-use crate::conversation::{
-    AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, EARLIER, FAILED, NONE, Party, RoleBinding, Side,
-    Tail,
-};
+use crate::conversation::party::{EARLIER, Party, Side, Tail};
+use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FAILED};
 use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::monitor::Monitor;
 use crate::protocol::act::Act;
@@ -40,7 +40,6 @@ use crate::{Library, Moment, MonitorLimits};
 
 const MAGIC: [u8; 8] = *b"fipa-cnv";
 const VERSION: u32 = 1;
-
 const BY_INITIATOR: u8 = 1;
 const CANCELED_BY_OTHER: u8 = 2;
 const ECHO: u8 = 4;

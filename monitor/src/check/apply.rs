@@ -1,13 +1,15 @@
 //! Changes of a conversation by an accepted message or by a timeout.
 
 use crate::Header;
-use crate::check::judge::{Move, MoveTarget, ObservedMessage, unbound};
+use crate::check::judge::{Move, MoveTarget, unbound};
+use crate::check::observed::ObservedMessage;
 use crate::clock::span_millis;
+use crate::conversation::bindings::RoleBinding;
 use crate::conversation::deadlines::{Deadline, Deadlines};
 use crate::conversation::names::Names;
-use crate::conversation::{
-    CANCELLING, Conversation, FAILED, NONE, Party, RoleBinding, Side, act_number, side_index,
-};
+use crate::conversation::party::{Party, Side, act_number, side_index};
+use crate::conversation::state::{CANCELLING, FAILED};
+use crate::conversation::{Conversation, NONE};
 use crate::protocol::machine::{After, Machine, Scope};
 
 /// Applies the timeouts that are due.

@@ -15,10 +15,13 @@
 
 use std::sync::Arc;
 
-use crate::check::judge::ObservedMessage;
+use crate::check::observed::ObservedMessage;
+use crate::check::outcome::Denied;
+use crate::conversation::NONE;
 use crate::conversation::names::Names;
-use crate::conversation::{ELSEWHERE, NONE, Party, Side, act_number, side_index};
-use crate::monitor::{Denied, Monitor};
+use crate::conversation::party::{Party, Side, act_number, side_index};
+use crate::conversation::state::ELSEWHERE;
+use crate::monitor::Monitor;
 use crate::protocol::act::{Act, FAILURE, INFORM};
 use crate::protocol::machine::{Cancel, Machine, Scope, step};
 use crate::verdict::{Unchecked, ViolationKind as Kind};

@@ -1,36 +1,20 @@
 //! Checks a message against its conversation and computes the moves of all concerned parties. This
 //! module does not change the conversation.
 
-use std::borrow::Cow;
 use std::collections::HashMap;
 
 use fipa_acl::is_pattern;
 
+use crate::check::next_state::{NextState, PartyMessage, next_state};
+use crate::check::observed::ObservedMessage;
+use crate::check::outcome::Fault;
 use crate::conversation::names::{Name, Names};
-use crate::conversation::{
-    AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, Conversation, ELSEWHERE, FAILED, NONE, NextState,
-    Party, PartyMessage, Side, next_state, side_index,
-};
-use crate::protocol::act::{Act, FAILURE, INFORM};
+use crate::conversation::party::{Party, Side, side_index};
+use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, ELSEWHERE, FAILED};
+use crate::conversation::{Conversation, NONE};
+use crate::protocol::act::{FAILURE, INFORM};
 use crate::protocol::machine::{Cancel, Guard, Machine, Scope, step};
 use crate::verdict::ViolationKind as Kind;
-
-/// A message with the values that every check of it needs.
-pub(crate) struct ObservedMessage<'a> {
-    pub(crate) act: Act<'a>,
-    pub(crate) sender: &'a str,
-    /// The receivers, each once.
-    pub(crate) receivers: &'a [Cow<'a, str>],
-    pub(crate) reply_with: u64,
-    pub(crate) reply_with_text: &'a str,
-    pub(crate) in_reply_to: u64,
-    /// Whether the sender is the monitored agent.
-    pub(crate) own: bool,
-    /// The agent that did not get a message, if this is the report of a message transport service.
-    pub(crate) undelivered_to: Option<&'a str>,
-    /// Index of the monitored agent in the receivers, if another agent is the sender.
-    pub(crate) own_receiver: Option<usize>,
-}
 
 /// The state transition of one party.
 #[derive(Debug, Clone, Copy)]
@@ -59,24 +43,6 @@ impl MoveTarget {
     /// Whether the move adds a party with a name.
     pub(crate) fn is_new(self) -> bool {
         matches!(self, Self::Receiver(_) | Self::Sender)
-    }
-}
-
-/// The kind of a violation, and the party with the violated state.
-#[derive(Debug, Clone)]
-pub(crate) struct Fault {
-    pub(crate) kind: Kind,
-    pub(crate) state: Option<u16>,
-    pub(crate) participant: Option<String>,
-}
-
-impl Fault {
-    pub(crate) fn plain(kind: Kind) -> Self {
-        Self {
-            kind,
-            state: None,
-            participant: None,
-        }
     }
 }
 

@@ -1,7 +1,349 @@
 //! The check of a message: the conversation to which it belongs, the verdict, and the changes that it makes.
 
+mod alternatives;
 pub(crate) mod apply;
+mod bound;
+mod copies;
 mod delegated;
+mod embedded;
+mod find;
 pub(crate) mod judge;
+mod next_state;
+mod observed;
+mod open;
+pub(crate) mod outcome;
 pub(crate) mod report;
-pub(crate) mod roles;
+mod roles;
+mod undelivered;
+
+use std::borrow::Cow;
+use std::hash::BuildHasher;
+use std::sync::Arc;
+
+use smallvec::SmallVec;
+
+use crate::check::alternatives::{PartiesBefore, keep_alternatives};
+use crate::check::apply::{Change, expire};
+use crate::check::bound::{NewBindings, growth_by, is_crowded};
+use crate::check::copies::{keep_copied, take_copy};
+use crate::check::find::MAX_LOOKED_AT;
+use crate::check::judge::{Move, judge};
+use crate::check::observed::ObservedMessage;
+use crate::check::outcome::{Denied, Fault, Passed};
+use crate::check::report::violation;
+use crate::conversation::NONE;
+use crate::conversation::deadlines::Deadline;
+use crate::conversation::state::{is_final, is_over, state_name};
+use crate::conversation::table::{List, Slot};
+use crate::limits::{MAX_DESIGNATED, MAX_TEXT};
+use crate::monitor::Monitor;
+use crate::protocol::act::NOT_UNDERSTOOD;
+use crate::protocol::machine::{Machine, Scope};
+use crate::verdict::{Accepted, Unchecked, Verdict, ViolationKind as Kind};
+use crate::{Header, Moment};
+
+impl Monitor {
+    #[cold]
+    pub(crate) fn denied(&mut self, header: &Header<'_>, denied: Denied) -> Verdict<'_> {
+        match denied {
+            Denied::Unchecked(why) => Verdict::Unchecked(why),
+            // A service that reports a failure follows no protocol.
+            Denied::Fault(..) | Denied::NotOpened(_) if header.undelivered_name().is_some() => {
+                Verdict::Unchecked(Unchecked::UnknownHistory)
+            }
+            denied => {
+                let key = |from, to: &str| self.key_of_refused(header, from, to);
+                let sender = header.sender_name().unwrap_or_default();
+                if header.act() == NOT_UNDERSTOOD {
+                    let receivers = header.receiver_names().iter().take(MAX_LOOKED_AT);
+                    let answered: SmallVec<[u64; 2]> =
+                        receivers.map(|receiver| key(receiver, sender)).collect();
+                    if self.refused.take(&answered) {
+                        return Verdict::Unchecked(Unchecked::AnswersViolation);
+                    }
+                } else {
+                    let receivers = header.receiver_names().iter().take(MAX_LOOKED_AT);
+                    let refused: SmallVec<[u64; 2]> =
+                        receivers.map(|receiver| key(sender, receiver)).collect();
+                    self.refused.add(&refused);
+                }
+                let violation = violation(&self.library, &self.table, &self.names, header, denied);
+                Verdict::Violation(Box::new(violation))
+            }
+        }
+    }
+
+    fn key_of_refused(&self, header: &Header<'_>, from: &str, to: &str) -> u64 {
+        self.hasher.hash_one((header.conversation(), from, to))
+    }
+
+    pub(crate) fn accepted(&self, passed: &Passed) -> Verdict<'_> {
+        let Some(machine) = self.library.machine(passed.machine) else {
+            return Verdict::Unchecked(Unchecked::UnknownProtocol);
+        };
+        let own = machine.state(passed.state);
+        let (state, ended, over) = match own {
+            Some(own) => (own.id(), own.is_final(), own.is_over()),
+            None => (
+                state_name(machine, passed.state),
+                is_final(machine, passed.state),
+                is_over(machine, passed.state),
+            ),
+        };
+        Verdict::Accepted(Accepted {
+            protocol: machine.name(),
+            state,
+            own: own.is_some(),
+            opened: passed.opened,
+            ended,
+            over,
+            complete: passed.complete,
+            late: passed.late,
+            void: passed.void,
+            elsewhere: passed.elsewhere,
+        })
+    }
+
+    pub(crate) fn take(&mut self, header: &Header<'_>, now: Moment) -> Result<Passed, Denied> {
+        let unchecked = |why| Err(Denied::Unchecked(why));
+        let Some(id) = header.conversation() else {
+            return Err(self.without_conversation(header));
+        };
+        let Some(sender) = header.sender_name() else {
+            return unchecked(Unchecked::NoSender);
+        };
+        if header.receiver_names().is_empty() {
+            return unchecked(Unchecked::NoReceiver);
+        }
+        if self.is_too_large(header, id, sender) {
+            return Err(match self.agent {
+                // Otherwise a large message would evade the checks.
+                Some(_) => Denied::Refused(Kind::TooLarge, None),
+                None => Denied::Unchecked(Unchecked::TooLarge),
+            });
+        }
+        let own = self.agent.as_deref() == Some(sender);
+        let other = header.other_receivers();
+        let mut receivers = other.as_deref().unwrap_or(header.receiver_names());
+        let mut own_receiver = None;
+        let (member, members);
+        if let Some(agent) = self.agent.as_ref().filter(|_| !own) {
+            own_receiver = receivers.iter().position(|receiver| **receiver == **agent);
+            if own_receiver.is_none() {
+                member = Arc::clone(agent);
+                members = [Cow::Borrowed(&*member)];
+                (receivers, own_receiver) = (&members, Some(0));
+            }
+        }
+        if receivers.is_empty() {
+            return unchecked(Unchecked::NoReceiver);
+        }
+        let observed = ObservedMessage {
+            act: header.act(),
+            sender,
+            receivers,
+            reply_with: self.fingerprints.of(header.reply_with_text()),
+            reply_with_text: header.reply_with_text().unwrap_or_default(),
+            in_reply_to: self.fingerprints.of(header.in_reply_to_text()),
+            own,
+            undelivered_to: header.undelivered_name(),
+            own_receiver,
+        };
+        let Some((main, slot)) = self.place(id, header, &observed) else {
+            if observed.undelivered_to.is_some() {
+                return unchecked(Unchecked::UnknownHistory);
+            }
+            let Some(protocol) = header.protocol_name() else {
+                return unchecked(Unchecked::NoProtocol);
+            };
+            let Some(machine) = self.library.index_of(protocol) else {
+                return Err(self.unknown_protocol(protocol));
+            };
+            return self.open(id, NONE, machine, header, &observed, now);
+        };
+        let machine = self.library.machine(slot.conversation.machine);
+        let follows = |name| {
+            machine.is_some_and(|machine: &Machine| machine.is_called(name))
+                || self.is_cancel_of(main, name, observed.sender, observed.act)
+        };
+        if header.protocol_name().is_none_or(follows) {
+            if slot.conversation.is_local()
+                && let Some(projection) = machine.and_then(|machine| machine.projection.clone())
+            {
+                let passed = self.advance_local(main, &projection, &observed, now);
+                return passed.map_err(|denied| self.recheck_local(id, main, denied));
+            }
+            let passed = self.advance(main, header, &observed, now);
+            return passed.map_err(|denied| self.recheck(main, &observed, denied, now));
+        }
+        let library = Arc::clone(&self.library);
+        self.embedded(&library, main, header, &observed, now)
+    }
+
+    fn is_too_large(&self, header: &Header<'_>, id: &str, sender: &str) -> bool {
+        let too_long = |text: &str| text.len() > MAX_TEXT;
+        let (receivers, reply_to) = (header.receiver_names(), header.reply_to_names());
+        let too_long_one = |names: &[Cow<'_, str>]| names.iter().any(|name| too_long(name));
+        too_long(id)
+            || too_long(sender)
+            || header.peer_name().is_some_and(too_long)
+            || header.undelivered_name().is_some_and(too_long)
+            || header.receiver_count() > self.limits.participants
+            || header.addressed().len() > self.limits.participants
+            || reply_to.len() > MAX_DESIGNATED
+            || too_long_one(receivers)
+            || too_long_one(reply_to)
+            || header.groups().any(too_long_one)
+    }
+
+    fn without_conversation(&self, header: &Header<'_>) -> Denied {
+        let named = header.protocol_name();
+        let machine = named.and_then(|name| self.library.find(name));
+        if machine.is_some_and(|known| !self.policy.exempts(known.name()))
+            && self.policy.conversation_id
+        {
+            return Denied::Refused(Kind::NoConversation, None);
+        }
+        Denied::Unchecked(Unchecked::NoConversation)
+    }
+
+    fn unknown_protocol(&self, name: &str) -> Denied {
+        if self.policy.spelling && !self.policy.exempts(name) {
+            let is_checked = |machine: &Machine| !self.policy.exempts(machine.name());
+            if let Some(similar) = self.library.index_near(name, is_checked) {
+                return Denied::Refused(Kind::Misspelled, Some(similar));
+            }
+        }
+        Denied::Unchecked(Unchecked::UnknownProtocol)
+    }
+
+    /// Checks a message in an existing conversation and updates the conversation.
+    fn advance(
+        &mut self,
+        at: u32,
+        header: &Header<'_>,
+        observed: &ObservedMessage<'_>,
+        now: Moment,
+    ) -> Result<Passed, Denied> {
+        let now_ms = now.millis();
+        let fault = |kind| Denied::Fault(Fault::plain(kind), at);
+        let copied = self.copied(header, observed);
+        let Some(slot) = self.table.slot_mut(at) else {
+            return Err(fault(Kind::NotOpened));
+        };
+        let index = slot.conversation.machine;
+        let Some(machine) = self.library.machine(index) else {
+            return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
+        };
+        expire(machine, &mut slot.conversation, now_ms);
+        let copied = copied.filter(|_| machine.scope == Scope::Conversation);
+        if let Some((fingerprint, receiver)) = copied {
+            let names = &mut self.names;
+            let copy = (fingerprint, receiver);
+            match take_copy(&mut slot.conversation, names, observed, copy, &self.limits) {
+                Some(Ok(())) => {
+                    let passed = Passed::in_state_of(&slot.conversation, machine, index);
+                    self.charge(at);
+                    return Ok(passed);
+                }
+                Some(Err(kind)) => return Err(fault(kind)),
+                None => {}
+            }
+        }
+        let conversation = &slot.conversation;
+        judge(
+            machine,
+            conversation,
+            &self.names,
+            observed,
+            &mut self.moves,
+        )
+        .map_err(|fault| Denied::Fault(fault, at))?;
+        let is_new = |made: &&Move| made.target.is_new();
+        let added = self.moves.iter().filter(is_new).count();
+        let grown = conversation.parties.len() + added;
+        let moves = self.moves.as_slice();
+        let bindings = NewBindings::by(machine, conversation, &self.names, observed, moves, header);
+        let adds =
+            added > 0 || !header.reply_to_names().is_empty() || observed.undelivered_to.is_some();
+        let growth = if adds || machine.scope == Scope::Conversation {
+            let moves = (moves, &bindings, copied.is_some());
+            growth_by(machine, conversation, observed, moves, header)
+        } else {
+            0
+        };
+        let size = || Slot::COST + conversation.allocated() + growth;
+        if grown > self.limits.participants
+            || conversation.bound.len() + bindings.count() > self.limits.participants + 1
+            || is_crowded(conversation, &self.names, header)
+            || growth > 0 && size() > self.limits.share_of_bytes()
+        {
+            return Err(fault(Kind::TooMany));
+        }
+        let due = header.reply_by_time(now.wall);
+        let due = due.map_or(0, |due| now.millis_at(due));
+        let roles = self.moves.first().map(|made| made.next_state.roles);
+        let mut change = Change {
+            machine,
+            names: &mut self.names,
+            deadlines: &mut self.deadlines,
+            observed,
+            deadline: Deadline {
+                due: 0,
+                at,
+                generation: slot.generation,
+                party: 0,
+            },
+            now: now_ms,
+            due,
+            opened: false,
+            late: false,
+            void: false,
+            state: None,
+        };
+        let before = PartiesBefore::of(&slot.conversation, machine);
+        for made in &self.moves {
+            if machine.scope == Scope::Conversation {
+                change.bind(&mut slot.conversation, made.next_state.roles);
+            }
+            change.make(&mut slot.conversation, made);
+        }
+        if !header.reply_to_names().is_empty() {
+            if change.names_designated(&slot.conversation, &self.moves) {
+                change.designate(&mut slot.conversation, header);
+            } else {
+                change.delegate(&mut slot.conversation, &self.moves, header);
+            }
+        }
+        let (opened, moved) = (change.opened, change.state);
+        let (late, void) = (change.late, change.void);
+        if let Some(((fingerprint, receiver), roles)) = copied.zip(roles) {
+            keep_copied(&mut slot.conversation, fingerprint, receiver, roles);
+        }
+        if let Some(before) = before {
+            let moves = (self.moves.as_slice(), before);
+            keep_alternatives(machine, &mut slot.conversation, observed, moves);
+        }
+        let passed = Passed::in_state_of(&slot.conversation, machine, index);
+        let passed = Passed {
+            state: moved.unwrap_or(passed.state),
+            opened,
+            late,
+            void,
+            ..passed
+        };
+        let is_charged = slot.is_charged();
+        // An embedded conversation is in no list, and one that is not complete is not over.
+        let is_main = slot.parent == NONE;
+        if is_main && (passed.complete || !slot.touch(List::Open, now_ms)) {
+            self.touch(at, now_ms);
+        }
+        if !is_charged {
+            self.charge(at);
+        }
+        if self.deadlines.are_many() {
+            self.remove_stale_deadlines();
+        }
+        Ok(passed)
+    }
+}

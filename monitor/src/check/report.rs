@@ -1,16 +1,18 @@
 //! Descriptions of violations: the message, the state of the conversation, the expected messages.
 
-use crate::check::judge::Fault;
+use crate::check::outcome::{Denied, Fault};
+use crate::conversation::Conversation;
 use crate::conversation::names::Names;
+use crate::conversation::party::{Party, Tail};
+use crate::conversation::state::{CANCELLING, FAILED, state_name};
 use crate::conversation::table::Table;
-use crate::conversation::{CANCELLING, Conversation, FAILED, Party, Tail, state_name};
-use crate::monitor::Denied;
 use crate::protocol::machine::{Machine, Roles, Scope, State};
 use crate::verdict::{Expected, ReplyMismatch, Violation, ViolationKind as Kind};
 use crate::{Header, Library};
 
 /// Maximum number of receivers in a violation.
 const MAX_NAMED: usize = 16;
+
 /// Maximum length of a text of a message in a violation, in bytes.
 const MAX_SHOWN: usize = 4_096;
 

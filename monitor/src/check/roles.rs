@@ -3,12 +3,16 @@
 
 use std::sync::Arc;
 
-use crate::check::judge::{Fault, ObservedMessage, unbound};
+use crate::check::judge::unbound;
+use crate::check::observed::ObservedMessage;
+use crate::check::outcome::{Denied, Fault, Passed};
+use crate::conversation::bindings::RoleBinding;
 use crate::conversation::names::Names;
-use crate::conversation::{
-    AFTER_NOT_UNDERSTOOD, Conversation, LastSent, NONE, Party, RoleBinding, act_number,
-};
-use crate::monitor::{Denied, Monitor, Passed};
+use crate::conversation::party::{Party, act_number};
+use crate::conversation::rare::LastSent;
+use crate::conversation::state::AFTER_NOT_UNDERSTOOD;
+use crate::conversation::{Conversation, NONE};
+use crate::monitor::Monitor;
 use crate::protocol::act::{CANCEL, FAILURE, NOT_UNDERSTOOD};
 use crate::protocol::machine::Machine;
 use crate::protocol::projection::{LocalRun, NotLocal, Observed, Projection};

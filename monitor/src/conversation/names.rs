@@ -143,6 +143,11 @@ impl Names {
     }
 }
 
+/// A hash of a name. Names are small numbers that [`Names`] gives out, so it needs no key.
+pub(crate) fn spread(name: Name) -> u64 {
+    u64::from(name).wrapping_mul(0x9e37_79b9_7f4a_7c15)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -2,7 +2,7 @@
 
 use std::ops::{Deref, DerefMut};
 
-use crate::conversation::{Details, Party};
+use crate::conversation::party::{Details, Party};
 
 /// The parties of a conversation. A single one needs no allocation, and is in the cache line after the other
 /// fields: see [`Slot`](crate::conversation::table::Slot).

@@ -9,7 +9,7 @@ use hashbrown::HashTable;
 use siphasher::sip128::SipHasher13;
 
 use crate::conversation::index::Index;
-use crate::conversation::names::Name;
+use crate::conversation::names::{Name, spread};
 use crate::conversation::{Conversation, NONE};
 
 /// A list of conversations.
@@ -150,6 +150,7 @@ const UNLINKED: Link = Link {
 
 /// Index of the link in the list of all conversations.
 const ALL: usize = 0;
+
 /// Index of the link in the list of the peer.
 const PEERS: usize = 1;
 
@@ -563,11 +564,6 @@ impl Table {
 
 /// Maximum capacity of the buffer for the identifier of a free slot, in bytes.
 const KEPT: usize = 128;
-
-/// A hash of a name. Names are small numbers that this table gives out, so it needs no key.
-pub(crate) fn spread(name: Name) -> u64 {
-    u64::from(name).wrapping_mul(0x9e37_79b9_7f4a_7c15)
-}
 
 #[cfg(test)]
 mod tests {

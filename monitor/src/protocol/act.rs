@@ -2,7 +2,7 @@
 
 use fipa_acl::{Pattern, PatternError, Performative};
 
-use crate::policy::one_edit_apart;
+use crate::protocol::spelling::one_edit_apart;
 
 /// The bits of all standard performatives.
 const STANDARD: u32 = (1 << 22) - 1;

@@ -1,8 +1,8 @@
 //! Libraries of protocols by name.
 
 use crate::Machine;
-use crate::policy::one_edit_apart;
 use crate::protocol::scxml::ScxmlError;
+use crate::protocol::spelling::one_edit_apart;
 
 /// Maximum number of protocols in a library.
 const MAX_MACHINES: usize = 256;

@@ -7,3 +7,4 @@ pub(crate) mod library;
 pub(crate) mod machine;
 pub mod projection;
 pub mod scxml;
+pub(crate) mod spelling;

@@ -8,12 +8,12 @@ use fipa_acl::{Pattern, PatternError};
 
 use super::document::{self, Document};
 use super::{Ambiguity, Doubt, MAX_MISTAKES, Mistake, Problem, Warning};
-use crate::policy::one_edit_apart;
 use crate::protocol::act::{Acts, is_word, near_standard};
 use crate::protocol::machine::{
     After, Cancel, Guard, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
 };
 use crate::protocol::projection::Projection;
+use crate::protocol::spelling::one_edit_apart;
 
 /// Maximum number of transitions of a state, including those behind optional transitions.
 const MAX_STEPS: usize = 100;

@@ -1,0 +1,150 @@
+//! Conversations that may have begun before the monitor: the states to which their first message may have led.
+
+use crate::Moment;
+use crate::check::judge::{Move, MoveTarget};
+use crate::check::next_state::NextState;
+use crate::check::observed::ObservedMessage;
+use crate::check::outcome::Denied;
+use crate::conversation::state::{CANCELLED, CANCELLING, FAILED};
+use crate::conversation::{Conversation, NONE};
+use crate::monitor::Monitor;
+use crate::protocol::machine::{Machine, Scope, step};
+use crate::verdict::Unchecked;
+
+impl Monitor {
+    /// Reconsiders the refusal of a message in a conversation of which the monitor may not know all.
+    #[cold]
+    pub(crate) fn recheck(
+        &mut self,
+        at: u32,
+        observed: &ObservedMessage<'_>,
+        denied: Denied,
+        now: Moment,
+    ) -> Denied {
+        if observed.undelivered_to.is_some() {
+            return denied;
+        }
+        let denied = self.recheck_delegated(at, observed, denied, now);
+        self.recheck_beginning(at, denied)
+    }
+
+    /// If a conversation may have begun before the monitor, a violation is none: it shows that the
+    /// first message continued the conversation.
+    fn recheck_beginning(&mut self, at: u32, denied: Denied) -> Denied {
+        let slot = self.table.slot(at);
+        let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
+        let uncertain = rare.is_some_and(|rare| !rare.alternatives.is_empty());
+        match denied {
+            Denied::Fault(..) if uncertain => {
+                self.forget(at);
+                Denied::Unchecked(Unchecked::UnknownHistory)
+            }
+            denied => denied,
+        }
+    }
+}
+
+/// The parties of a conversation before a message.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct PartiesBefore {
+    /// Number of the parties with messages.
+    count: usize,
+    has_unnamed: bool,
+}
+
+impl PartiesBefore {
+    /// Returns the parties of a conversation that may have begun before the monitor.
+    #[inline]
+    pub(crate) fn of(conversation: &Conversation, machine: &Machine) -> Option<Self> {
+        let rare = conversation.rare.as_deref();
+        let may_continue = rare.is_some_and(|rare| rare.may_continue);
+        may_continue.then(|| Self::known(conversation, machine))
+    }
+
+    #[cold]
+    fn known(conversation: &Conversation, machine: &Machine) -> Self {
+        let mut parties = conversation.parties.iter();
+        // With one state for all participants, the party exists before the first message.
+        let is_new =
+            machine.scope == Scope::Conversation && parties.all(|party| party.acts == [0; 2]);
+        Self {
+            count: if is_new {
+                0
+            } else {
+                conversation.parties.len()
+            },
+            has_unnamed: conversation.unnamed().is_some(),
+        }
+    }
+}
+
+/// In a conversation that may have begun before the monitor: notes the other states to which the first
+/// message to a party may have led, and removes those which a later message does not fit.
+#[cold]
+pub(crate) fn keep_alternatives(
+    machine: &Machine,
+    conversation: &mut Conversation,
+    observed: &ObservedMessage<'_>,
+    (moves, before): (&[Move], PartiesBefore),
+) {
+    let count = conversation.parties.len();
+    let Some(rare) = conversation.rare.as_deref_mut() else {
+        return;
+    };
+    let index = |at: usize| u32::try_from(at).unwrap_or(NONE);
+    let step_of = |party: u32| {
+        let mut steps = moves.iter().filter(|made| {
+            let NextState { void, state, .. } = made.next_state;
+            !void && !made.reported && state != FAILED
+        });
+        steps.find(|made| match made.target {
+            MoveTarget::Party(at) => index(at) == party,
+            MoveTarget::Unnamed => party == NONE,
+            MoveTarget::Receiver(_) | MoveTarget::Sender => false,
+        })
+    };
+    // A cancel and its answers fit any state, but a message may also be a step of the protocol.
+    let fits_any_state = |made: &Move| {
+        let NextState { state, crossed, .. } = made.next_state;
+        made.next_state.answers_cancel || [CANCELLING, CANCELLED].contains(&state) && !crossed
+    };
+    let alternatives = std::mem::take(&mut rare.alternatives);
+    let kept = alternatives.into_iter().flat_map(|(party, state)| {
+        let made = step_of(party).filter(|_| state != FAILED);
+        let stays = made.is_none_or(fits_any_state);
+        let step = made.and_then(|_| {
+            let state = machine.state(state)?;
+            step(&state.steps, observed.act, u32::MAX, u32::MAX)
+        });
+        let stays = stays.then_some((party, state));
+        stays
+            .into_iter()
+            .chain(step.map(|step| (party, step.target)))
+    });
+    let reported = moves.iter().filter(|made| made.reported);
+    let reported = reported.filter_map(|made| match made.target {
+        MoveTarget::Party(at) => Some(any_state_of(at)),
+        MoveTarget::Unnamed | MoveTarget::Receiver(_) | MoveTarget::Sender => None,
+    });
+    rare.alternatives = kept.chain(reported).collect();
+    rare.alternatives.sort_unstable();
+    rare.alternatives.dedup();
+    let first = &machine.initial().steps;
+    let Some(first) = step(first, observed.act, u32::MAX, u32::MAX) else {
+        return;
+    };
+    let unnamed = (rare.unnamed.is_some() && !before.has_unnamed).then_some(NONE);
+    let new = (before.count..count).map(index);
+    let others = machine.later_targets(observed.act, first);
+    for party in new.chain(unnamed) {
+        let others = others.iter().map(|state| (party, *state));
+        rare.alternatives.extend(others);
+    }
+}
+
+/// The entry of [`Rare::alternatives`](crate::conversation::Rare::alternatives) of a party after an
+/// undelivered message: the state before the first known message is unknown, and a message that has ruled
+/// out states has no effect.
+pub(crate) fn any_state_of(party: usize) -> (u32, u16) {
+    (u32::try_from(party).unwrap_or(NONE), FAILED)
+}

@@ -1,0 +1,95 @@
+//! Messages to several receivers, of which an observer gets each copy by itself.
+
+use std::hash::BuildHasher;
+
+use crate::check::observed::ObservedMessage;
+use crate::conversation::Conversation;
+use crate::conversation::bindings::RoleBinding;
+use crate::conversation::names::Names;
+use crate::conversation::rare::Copied;
+use crate::conversation::table::Slot;
+use crate::monitor::Monitor;
+use crate::verdict::ViolationKind as Kind;
+use crate::{Header, MonitorLimits};
+
+impl Monitor {
+    /// Returns fingerprints of a message and of its receiver, if this is the copy for one of several
+    /// receivers.
+    pub(crate) fn copied(
+        &self,
+        header: &Header<'_>,
+        observed: &ObservedMessage<'_>,
+    ) -> Option<(u64, u64)> {
+        let addressed = header.addressed();
+        let first = addressed.first()?;
+        let receiver = observed.receivers.first()?;
+        if addressed.len() == 1 && first == receiver {
+            return None;
+        }
+        let message = (
+            header.act().name(),
+            observed.sender,
+            addressed,
+            observed.reply_with,
+            observed.in_reply_to,
+        );
+        Some((
+            self.hasher.hash_one(message),
+            self.hasher.hash_one(&**receiver),
+        ))
+    }
+}
+
+/// If the message is another copy of the last one to several receivers: gives its receiver the role of the
+/// receivers, unless there are too many.
+pub(crate) fn take_copy(
+    conversation: &mut Conversation,
+    names: &mut Names,
+    observed: &ObservedMessage<'_>,
+    (fingerprint, receiver): (u64, u64),
+    limits: &MonitorLimits,
+) -> Option<Result<(), Kind>> {
+    let mut all = conversation.rare.as_deref()?.copied.iter().enumerate();
+    let (place, copied) = all.find(|(_, copied)| copied.fingerprint == fingerprint)?;
+    if copied.seen.contains(&receiver) {
+        return None;
+    }
+    let name = observed.receivers.first()?;
+    let seen = (copied.seen.len() + 1).next_power_of_two() * size_of::<u64>();
+    let bytes = conversation.allocated() + conversation.growth(0, 1, 0);
+    let size = Slot::COST + bytes + seen + Names::cost(name.len());
+    if conversation.bound.len() >= limits.participants
+        || copied.seen.len() == limits.participants
+        || size > limits.share_of_bytes()
+    {
+        return Some(Err(Kind::TooMany));
+    }
+    let copied = conversation.rare().copied.get_mut(place)?;
+    copied.seen.push(receiver);
+    let (_, to) = copied.roles;
+    if to.count_ones() == 1 {
+        let role = u8::try_from(to.trailing_zeros()).unwrap_or(0);
+        let agent = conversation.acquire(names, name);
+        conversation.bound.push(RoleBinding { role, agent });
+    }
+    Some(Ok(()))
+}
+
+/// Keeps a message of which further copies may follow.
+pub(crate) fn keep_copied(
+    conversation: &mut Conversation,
+    fingerprint: u64,
+    receiver: u64,
+    roles: (u32, u32),
+) {
+    let copied = &mut conversation.rare().copied;
+    copied.retain(|copied| copied.fingerprint != fingerprint);
+    if copied.len() == Copied::MAX {
+        copied.remove(0);
+    }
+    copied.push(Copied {
+        fingerprint,
+        seen: vec![receiver],
+        roles,
+    });
+}

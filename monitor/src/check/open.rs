@@ -1,0 +1,136 @@
+//! Begins a conversation with its first message.
+
+use std::sync::Arc;
+
+use crate::check::observed::ObservedMessage;
+use crate::check::outcome::{Denied, Passed};
+use crate::conversation::NONE;
+use crate::conversation::names::Names;
+use crate::conversation::party::Party;
+use crate::monitor::Monitor;
+use crate::protocol::machine::{Machine, Scope, step};
+use crate::verdict::{Unchecked, ViolationKind as Kind};
+use crate::{Header, Moment};
+
+impl Monitor {
+    pub(crate) fn open(
+        &mut self,
+        id: &str,
+        parent: u32,
+        machine: u16,
+        header: &Header<'_>,
+        observed: &ObservedMessage<'_>,
+        now: Moment,
+    ) -> Result<Passed, Denied> {
+        let library = Arc::clone(&self.library);
+        let Some(protocol) = library.machine(machine) else {
+            return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
+        };
+        // Checked before eviction, so that an invalid message evicts no conversation.
+        if parent == NONE
+            && let Some(projection) = protocol.projection.clone().filter(|_| self.agent.is_some())
+        {
+            let machine = (machine, protocol);
+            return self.open_local(id, machine, &projection, (header, observed), now);
+        }
+        let begins = step(&protocol.initial().steps, observed.act, u32::MAX, u32::MAX);
+        let Some(begins) = begins else {
+            return Err(match parent {
+                NONE => self.unopened(id, machine, protocol, header, observed, now),
+                _ => Denied::NotOpened(machine),
+            });
+        };
+        let at = self.insert(id, parent, machine, (header, observed), now)?;
+        let may_continue = parent == NONE && !self.is_certain(id);
+        if let Some(slot) = self.table.slot_mut(at) {
+            let conversation = &mut slot.conversation;
+            conversation.initiator = conversation.acquire(&mut self.names, observed.sender);
+            if protocol.scope == Scope::Conversation {
+                let party = Party::new(NONE, protocol.initial);
+                conversation.parties.push(party);
+            }
+            if may_continue && protocol.may_repeat(observed.act, begins) {
+                conversation.rare().may_continue = true;
+            }
+        }
+        let passed = self.advance(at, header, observed, now);
+        passed.map_err(|denied| {
+            self.remove(at);
+            match denied {
+                Denied::Fault(fault, _) if fault.kind == Kind::TooMany => {
+                    Denied::Refused(Kind::TooMany, None)
+                }
+                Denied::Fault(..) => Denied::NotOpened(machine),
+                other => other,
+            }
+        })
+    }
+
+    /// Inserts a conversation that a message begins, and evicts others for it.
+    pub(crate) fn insert(
+        &mut self,
+        id: &str,
+        parent: u32,
+        machine: u16,
+        (header, observed): (&Header<'_>, &ObservedMessage<'_>),
+        now: Moment,
+    ) -> Result<u32, Denied> {
+        if parent == NONE {
+            self.evict_alike(id)?;
+        }
+        let peer = match self.table.slot(parent) {
+            Some(_) => self.names.acquire_again(self.table.peer(parent)),
+            None if observed.own => NONE,
+            None => {
+                let peer = header.peer_name().unwrap_or(observed.sender);
+                self.names.acquire(peer)
+            }
+        };
+        let peer_cost = match peer {
+            NONE => 0,
+            peer => Names::cost(self.names.text(peer).len()),
+        };
+        // Its bytes are charged, and others evicted for them, when the message has been accepted.
+        self.evict(parent, peer, 1);
+        let at = self.table.insert(id, parent, peer, machine, now.millis());
+        if let Some(slot) = self.table.slot_mut(at) {
+            slot.conversation.charge(peer_cost);
+        }
+        Ok(at)
+    }
+
+    /// Returns the verdict on a message that begins no conversation, if the monitor has none for it.
+    fn unopened(
+        &mut self,
+        id: &str,
+        machine: u16,
+        protocol: &Machine,
+        header: &Header<'_>,
+        observed: &ObservedMessage<'_>,
+        now: Moment,
+    ) -> Denied {
+        if !protocol.may_follow(observed.act) {
+            return Denied::NotOpened(machine);
+        }
+        let certain = self.is_certain(id);
+        if self.agent.is_none() || observed.own {
+            if certain {
+                return Denied::NotOpened(machine);
+            }
+            return Denied::Unchecked(Unchecked::UnknownHistory);
+        }
+        if certain && self.policy.unsolicited && !self.policy.exempts(protocol.name()) {
+            return Denied::Refused(Kind::Unsolicited, None);
+        }
+        // The sender may have named the monitored agent in a `reply-to`, or the agent has restarted.
+        if protocol.shows_initiator(observed.act) {
+            if let Err(denied) = self.join(id, NONE, machine, (header, observed), now) {
+                return denied;
+            }
+            return Denied::Unchecked(Unchecked::BegunElsewhere);
+        }
+        // The agent may answer.
+        self.remember_removed(id);
+        Denied::Unchecked(Unchecked::UnknownHistory)
+    }
+}
