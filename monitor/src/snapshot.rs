@@ -26,10 +26,10 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};
 
-use crate::conversation::NONE;
 use crate::conversation::bindings::RoleBinding;
 use crate::conversation::deadlines::Deadline;
-use crate::conversation::names::{Name, Names};
+use crate::conversation::ids::{PartyIndex, SlotIndex};
+use crate::conversation::names::Names;
 use crate::conversation::party::{EARLIER, Party, Side, Tail};
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FAILED};
 use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
@@ -104,7 +104,7 @@ impl Monitor {
         if agent.is_empty() {
             return out;
         }
-        let mut mains: Vec<(u64, u64, u32)> = self.table.mains().collect();
+        let mut mains: Vec<(u64, u64, SlotIndex)> = self.table.mains().collect();
         mains.sort_unstable_by(|one, other| other.cmp(one));
         // The oldest is written first.
         let mut written = Vec::new();
@@ -129,22 +129,28 @@ impl Monitor {
     }
 
     /// Writes a main conversation with its embedded ones. `None` if one of them is uncertain.
-    fn write_main(&self, main: u32, agent: &str, now: Moment, out: &mut Vec<u8>) -> Option<()> {
+    fn write_main(
+        &self,
+        main: SlotIndex,
+        agent: &str,
+        now: Moment,
+        out: &mut Vec<u8>,
+    ) -> Option<()> {
         self.write_part(main, agent, now, out)?;
         let count_at = out.len();
         put_count(out, 0);
-        let (mut count, mut child) = (0_u32, self.table.slot(main)?.child);
-        while child != NONE {
+        let (mut count, mut next) = (0_u32, self.table.slot(main)?.child);
+        while let Some(child) = next {
             self.write_part(child, agent, now, out)?;
             count += 1;
-            child = self.table.sibling(child);
+            next = self.table.sibling(child);
         }
         let place = out.get_mut(count_at..count_at + 4)?;
         place.copy_from_slice(&count.to_le_bytes());
         Some(())
     }
 
-    fn write_part(&self, at: u32, agent: &str, now: Moment, out: &mut Vec<u8>) -> Option<()> {
+    fn write_part(&self, at: SlotIndex, agent: &str, now: Moment, out: &mut Vec<u8>) -> Option<()> {
         let conversation = &self.table.slot(at)?.conversation;
         let names = &self.names;
         let machine = self.library.machine(conversation.machine)?;
@@ -156,14 +162,10 @@ impl Monitor {
         if local || conversation.joined || named || !takes_part {
             return None;
         }
-        let text = |name: Name| match name {
-            NONE => "",
-            name => names.text(name),
-        };
         put_text(out, machine.name())?;
         put_text(out, self.table.id(at))?;
-        put_text(out, text(self.table.peer(at)))?;
-        put_text(out, text(conversation.initiator))?;
+        put_text(out, names.text(self.table.peer(at)))?;
+        put_text(out, names.text(conversation.initiator))?;
         put_count(out, conversation.parties.len());
         for party in conversation.parties.iter() {
             write_party(machine, names, party, now, out)?;
@@ -175,16 +177,16 @@ impl Monitor {
         put_count(out, conversation.bound.len());
         for bound in conversation.bound.iter() {
             out.push(bound.role);
-            put_text(out, text(bound.agent))?;
+            put_text(out, names.text(bound.agent))?;
         }
         put_count(out, conversation.reply_to().len());
         for agent in conversation.reply_to() {
-            put_text(out, text(*agent))?;
+            put_text(out, names.text(*agent))?;
         }
         put_count(out, conversation.delegates().len());
         for (party, agent) in conversation.delegates() {
-            out.extend_from_slice(&party.to_le_bytes());
-            put_text(out, text(*agent))?;
+            put_count(out, party.get());
+            put_text(out, names.text(*agent))?;
         }
         Some(())
     }
@@ -209,22 +211,22 @@ impl Monitor {
         let read = Read::new(snapshot, &library, &self.limits, &agent, now)?;
         self.fingerprints.set_keys(read.keys);
         for (part, children) in &read.mains {
-            let main = self.put(part, NONE, now);
+            let main = self.put(part, None, now);
             for child in children {
-                self.put(child, main, now);
+                self.put(child, Some(main), now);
             }
             self.touch(main, now.millis());
             let peer = self.table.peer(main);
-            self.evict(main, peer, 0);
+            self.evict(Some(main), peer, 0);
         }
         self.last = now;
         Ok(self.len())
     }
 
-    fn put(&mut self, part: &Part<'_>, parent: u32, now: Moment) -> u32 {
+    fn put(&mut self, part: &Part<'_>, parent: Option<SlotIndex>, now: Moment) -> SlotIndex {
         let peer = match part.peer {
-            "" => NONE,
-            peer => self.names.acquire(peer),
+            "" => None,
+            peer => Some(self.names.acquire(peer)),
         };
         let at = self
             .table
@@ -234,21 +236,21 @@ impl Monitor {
         };
         let generation = slot.generation;
         let conversation = &mut slot.conversation;
-        if peer != NONE {
+        if peer.is_some() {
             conversation.charge(Names::cost(part.peer.len()));
         }
-        conversation.initiator = conversation.acquire(&mut self.names, part.initiator);
-        for (index, (peer, party)) in (0_u32..).zip(&part.parties) {
+        conversation.initiator = Some(conversation.acquire(&mut self.names, part.initiator));
+        for (index, (peer, party)) in part.parties.iter().enumerate() {
             let peer = match *peer {
-                "" => NONE,
-                peer => conversation.acquire(&mut self.names, peer),
+                "" => None,
+                peer => Some(conversation.acquire(&mut self.names, peer)),
             };
             if party.deadline != 0 {
                 self.deadlines.push(Deadline {
                     due: party.deadline,
                     at,
                     generation,
-                    party: index,
+                    party: PartyIndex::new(index),
                 });
             }
             conversation.add(Party {
@@ -315,8 +317,7 @@ fn write_party(
     if party.state == FAILED {
         return None;
     }
-    let peer = Some(party.peer).filter(|peer| *peer != NONE);
-    put_text(out, peer.map_or("", |peer| names.text(peer)))?;
+    put_text(out, names.text(party.peer))?;
     for state in [party.state, party.resume, party.before] {
         put_state(machine, state, out)?;
     }
@@ -363,7 +364,7 @@ struct Part<'s> {
     unnamed: Option<Party>,
     bound: Vec<(u8, &'s str)>,
     reply_to: Vec<&'s str>,
-    delegates: Vec<(u32, &'s str)>,
+    delegates: Vec<(PartyIndex, &'s str)>,
 }
 
 /// The input of the checks of a snapshot.
@@ -529,7 +530,8 @@ impl<'s> Input<'s> {
         let count = self.count(MAX_DESIGNATED, "number of agents in reply-to")?;
         let mut delegates = Vec::new();
         for _ in 0..count {
-            delegates.push((self.u32()?, self.name()?));
+            let party = usize::try_from(self.u32()?).unwrap_or(usize::MAX);
+            delegates.push((PartyIndex::new(party), self.name()?));
         }
         if reply_to.len() + delegates.len() > MAX_DESIGNATED {
             return Err(SnapshotError::TooLarge("number of agents in reply-to"));
@@ -561,7 +563,7 @@ impl<'s> Input<'s> {
         if bound.iter().any(|(role, _)| unknown(*role)) {
             return malformed("an unknown role");
         }
-        let no_party = |at: u32| usize::try_from(at).is_ok_and(|at| at >= parties.len());
+        let no_party = |at: PartyIndex| at.get() >= parties.len();
         if delegates.iter().any(|(party, _)| no_party(*party)) {
             return malformed("an unknown participant");
         }
@@ -630,7 +632,7 @@ impl<'s> Input<'s> {
             canceling_side: side(flags & CANCELED_BY_OTHER == 0),
             echo: flags & ECHO != 0,
             acts,
-            ..Party::new(NONE, state)
+            ..Party::new(None, state)
         };
         for side in 0..2 {
             let asked = self.u64()?;

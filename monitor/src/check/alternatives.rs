@@ -5,8 +5,9 @@ use crate::check::judge::{Move, MoveTarget};
 use crate::check::next_state::NextState;
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::Denied;
+use crate::conversation::Conversation;
+use crate::conversation::ids::{PartyIndex, SlotIndex};
 use crate::conversation::state::{CANCELLED, CANCELLING, FAILED};
-use crate::conversation::{Conversation, NONE};
 use crate::monitor::Monitor;
 use crate::protocol::machine::{Machine, Scope, step};
 use crate::verdict::Unchecked;
@@ -16,7 +17,7 @@ impl Monitor {
     #[cold]
     pub(crate) fn recheck(
         &mut self,
-        at: u32,
+        at: SlotIndex,
         observed: &ObservedMessage<'_>,
         denied: Denied,
         now: Moment,
@@ -30,7 +31,7 @@ impl Monitor {
 
     /// If a conversation may have begun before the monitor, a violation is none: it shows that the
     /// first message continued the conversation.
-    fn recheck_beginning(&mut self, at: u32, denied: Denied) -> Denied {
+    fn recheck_beginning(&mut self, at: SlotIndex, denied: Denied) -> Denied {
         let slot = self.table.slot(at);
         let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
         let uncertain = rare.is_some_and(|rare| !rare.alternatives.is_empty());
@@ -91,15 +92,15 @@ pub(crate) fn keep_alternatives(
     let Some(rare) = conversation.rare.as_deref_mut() else {
         return;
     };
-    let index = |at: usize| u32::try_from(at).unwrap_or(NONE);
-    let step_of = |party: u32| {
+    let index = |at: usize| Some(PartyIndex::new(at));
+    let step_of = |party: Option<PartyIndex>| {
         let mut steps = moves.iter().filter(|made| {
             let NextState { void, state, .. } = made.next_state;
             !void && !made.reported && state != FAILED
         });
         steps.find(|made| match made.target {
             MoveTarget::Party(at) => index(at) == party,
-            MoveTarget::Unnamed => party == NONE,
+            MoveTarget::Unnamed => party.is_none(),
             MoveTarget::Receiver(_) | MoveTarget::Sender => false,
         })
     };
@@ -133,7 +134,7 @@ pub(crate) fn keep_alternatives(
     let Some(first) = step(first, observed.act, u32::MAX, u32::MAX) else {
         return;
     };
-    let unnamed = (rare.unnamed.is_some() && !before.has_unnamed).then_some(NONE);
+    let unnamed = (rare.unnamed.is_some() && !before.has_unnamed).then_some(None);
     let new = (before.count..count).map(index);
     let others = machine.later_targets(observed.act, first);
     for party in new.chain(unnamed) {
@@ -145,6 +146,6 @@ pub(crate) fn keep_alternatives(
 /// The entry of [`Rare::alternatives`](crate::conversation::Rare::alternatives) of a party after an
 /// undelivered message: the state before the first known message is unknown, and a message that has ruled
 /// out states has no effect.
-pub(crate) fn any_state_of(party: usize) -> (u32, u16) {
-    (u32::try_from(party).unwrap_or(NONE), FAILED)
+pub(crate) fn any_state_of(party: usize) -> (Option<PartyIndex>, u16) {
+    (Some(PartyIndex::new(party)), FAILED)
 }

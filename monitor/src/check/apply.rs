@@ -4,12 +4,13 @@ use crate::Header;
 use crate::check::judge::{Move, MoveTarget, unbound};
 use crate::check::observed::ObservedMessage;
 use crate::clock::span_millis;
+use crate::conversation::Conversation;
 use crate::conversation::bindings::RoleBinding;
 use crate::conversation::deadlines::{Deadline, Deadlines};
+use crate::conversation::ids::PartyIndex;
 use crate::conversation::names::Names;
 use crate::conversation::party::{Party, Side, act_number, side_index};
 use crate::conversation::state::{CANCELLING, FAILED};
-use crate::conversation::{Conversation, NONE};
 use crate::protocol::machine::{After, Machine, Scope};
 
 /// Applies the timeouts that are due.
@@ -54,20 +55,23 @@ impl Change<'_> {
             MoveTarget::Receiver(number) => {
                 let receiver = self.observed.receivers.get(number);
                 let peer = conversation.acquire(self.names, receiver.map_or("", |name| name));
-                conversation.add(fresh(peer))
+                conversation.add(fresh(Some(peer)))
             }
             MoveTarget::Sender => {
                 let peer = conversation.acquire(self.names, self.observed.sender);
                 let unnamed = conversation.unnamed().cloned();
-                let party = unnamed.unwrap_or_else(|| fresh(peer));
-                conversation.add(Party { peer, ..party })
+                let party = unnamed.unwrap_or_else(|| fresh(None));
+                conversation.add(Party {
+                    peer: Some(peer),
+                    ..party
+                })
             }
             MoveTarget::Unnamed => {
                 let unnamed = conversation.rare().unnamed.take();
                 self.opened |= unnamed.is_none();
                 let mut party = match unnamed {
                     Some(party) => party,
-                    None => Box::new(fresh(NONE)),
+                    None => Box::new(fresh(None)),
                 };
                 self.move_party(&mut party, made);
                 conversation.rare().unnamed = Some(party);
@@ -81,7 +85,7 @@ impl Change<'_> {
             if party.deadline != 0 {
                 self.deadlines.push(Deadline {
                     due: party.deadline,
-                    party: u32::try_from(index).unwrap_or(NONE),
+                    party: PartyIndex::new(index),
                     ..self.deadline
                 });
             }
@@ -182,8 +186,8 @@ impl Change<'_> {
     pub(crate) fn designate(&mut self, conversation: &mut Conversation, header: &Header<'_>) {
         for name in header.reply_to_names() {
             let known = conversation.reply_to().iter();
-            let known = known.chain([&conversation.initiator]);
-            if !known.into_iter().any(|agent| self.names.is(*agent, name)) {
+            let mut known = known.copied().chain(conversation.initiator);
+            if !known.any(|agent| self.names.is(agent, name)) {
                 let name = conversation.acquire(self.names, name);
                 conversation.rare().reply_to.push(name);
             }
@@ -224,7 +228,7 @@ impl Change<'_> {
         if !moves.iter().any(answers) {
             return;
         }
-        let index = u32::try_from(at).unwrap_or(NONE);
+        let index = PartyIndex::new(at);
         for name in header.reply_to_names() {
             let known = self.names.is(conversation.initiator, name)
                 || conversation.party(self.names, name).is_some();

@@ -17,7 +17,7 @@ use std::sync::Arc;
 
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::Denied;
-use crate::conversation::NONE;
+use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
 use crate::conversation::party::{Party, Side, act_number, side_index};
 use crate::conversation::state::ELSEWHERE;
@@ -29,14 +29,14 @@ use crate::{Header, Moment};
 
 impl Monitor {
     /// Whether the conversation began between other agents.
-    pub(crate) fn is_joined(&self, at: u32) -> bool {
+    pub(crate) fn is_joined(&self, at: SlotIndex) -> bool {
         let slot = self.table.slot(at);
         slot.is_some_and(|slot| slot.conversation.joined)
     }
 
     /// Whether the conversation may continue without messages to the monitored agent: it began
     /// between other agents, or the monitored agent has named another agent in `reply-to`.
-    pub(crate) fn may_continue_elsewhere(&self, at: u32) -> bool {
+    pub(crate) fn may_continue_elsewhere(&self, at: SlotIndex) -> bool {
         let slot = self.table.slot(at);
         slot.zip(self.agent.as_deref())
             .is_some_and(|(slot, agent)| {
@@ -50,7 +50,7 @@ impl Monitor {
     pub(crate) fn join(
         &mut self,
         id: &str,
-        parent: u32,
+        parent: Option<SlotIndex>,
         machine: u16,
         (header, observed): (&Header<'_>, &ObservedMessage<'_>),
         now: Moment,
@@ -64,7 +64,7 @@ impl Monitor {
         let agent = self.agent.as_deref().unwrap_or_default();
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;
-            conversation.initiator = conversation.acquire(&mut self.names, agent);
+            conversation.initiator = Some(conversation.acquire(&mut self.names, agent));
             conversation.joined = true;
         }
         self.infer_state(at, protocol, observed, now);
@@ -74,7 +74,7 @@ impl Monitor {
     /// Reconsiders the refusal of a message in a conversation that may continue elsewhere.
     pub(crate) fn recheck_delegated(
         &mut self,
-        at: u32,
+        at: SlotIndex,
         observed: &ObservedMessage<'_>,
         denied: Denied,
         now: Moment,
@@ -102,7 +102,7 @@ impl Monitor {
                     || receivers.any(|receiver| self.names.is(party.peer, receiver));
                 // The state after an undelivered message is unknown too.
                 [party.state, party.resume].contains(&ELSEWHERE)
-                    && (party.peer == NONE || addressed())
+                    && (party.peer.is_none() || addressed())
             };
             slot.conversation.parties.iter().any(unknown)
                 && machine.is_sent_by_initiator(observed.act)
@@ -124,7 +124,7 @@ impl Monitor {
     /// Infers the state from an answer.
     fn infer_state(
         &mut self,
-        at: u32,
+        at: SlotIndex,
         machine: &Machine,
         observed: &ObservedMessage<'_>,
         now: Moment,
@@ -132,7 +132,7 @@ impl Monitor {
         let Some(slot) = self.table.slot_mut(at) else {
             return;
         };
-        let main = if slot.parent == NONE { at } else { slot.parent };
+        let main = slot.parent.unwrap_or(at);
         let conversation = &mut slot.conversation;
         let (known, state) = match machine.scope {
             Scope::Participant => {
@@ -154,8 +154,8 @@ impl Monitor {
             Some(party) => party.peer,
             None if conversation.parties.len() == self.limits.participants => return,
             None if grown > self.limits.share_of_bytes() => return,
-            None if machine.scope == Scope::Conversation => NONE,
-            None => conversation.acquire(&mut self.names, observed.sender),
+            None if machine.scope == Scope::Conversation => None,
+            None => Some(conversation.acquire(&mut self.names, observed.sender)),
         };
         let mut party = Party::new(peer, state);
         party.acts[side_index(Side::Other)] = act_number(observed.act);

@@ -2,9 +2,10 @@
 
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::{Denied, Fault, Passed};
+use crate::conversation::Conversation;
+use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
 use crate::conversation::party::Party;
-use crate::conversation::{Conversation, NONE};
 use crate::monitor::Monitor;
 use crate::protocol::machine::{Machine, Scope};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
@@ -16,7 +17,7 @@ impl Monitor {
     pub(crate) fn embedded(
         &mut self,
         library: &Library,
-        main: u32,
+        main: SlotIndex,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
         now: Moment,
@@ -25,8 +26,8 @@ impl Monitor {
         let (mut denied, mut open) = (None, None);
         let mut children = 0;
         let mut may_begin = self.may_begin(library, main, name, observed.sender);
-        let mut child = self.table.slot(main).map_or(NONE, |slot| slot.child);
-        while child != NONE {
+        let mut next = self.table.slot(main).and_then(|slot| slot.child);
+        while let Some(child) = next {
             children += 1;
             may_begin |= self.may_begin(library, child, name, observed.sender);
             let called = self.machine_of(library, child);
@@ -40,7 +41,7 @@ impl Monitor {
                     Err(fault) => denied = denied.or(Some(fault)),
                 }
             }
-            child = self.table.sibling(child);
+            next = self.table.sibling(child);
         }
         if !may_begin {
             return Err(match (denied, open) {
@@ -50,7 +51,7 @@ impl Monitor {
                     let inner = library.index_of(name).filter(|_| !observed.own);
                     if let Some(inner) = inner.filter(|_| children < self.limits.embedded) {
                         let id = header.conversation().unwrap_or_default();
-                        let _ = self.join(id, main, inner, (header, observed), now);
+                        let _ = self.join(id, Some(main), inner, (header, observed), now);
                     }
                     Denied::Unchecked(Unchecked::BegunElsewhere)
                 }
@@ -67,7 +68,7 @@ impl Monitor {
             return Err(Denied::Fault(Fault::plain(Kind::TooMany), main));
         }
         let id = header.conversation().unwrap_or_default();
-        match self.open(id, main, machine, header, observed, now) {
+        match self.open(id, Some(main), machine, header, observed, now) {
             Ok(passed) => {
                 self.touch(main, now.millis());
                 Ok(passed)
@@ -80,7 +81,7 @@ impl Monitor {
     pub(crate) fn may_begin(
         &self,
         library: &Library,
-        at: u32,
+        at: SlotIndex,
         protocol: &str,
         sender: &str,
     ) -> bool {
@@ -89,7 +90,13 @@ impl Monitor {
 
     /// Whether another agent than the monitored one may have begun a conversation of this protocol
     /// within its conversation, so that an unknown agent sends messages to it. Recruited agents do so.
-    fn began_elsewhere(&self, library: &Library, at: u32, protocol: &str, sender: &str) -> bool {
+    fn began_elsewhere(
+        &self,
+        library: &Library,
+        at: SlotIndex,
+        protocol: &str,
+        sender: &str,
+    ) -> bool {
         let Some(agent) = &self.agent else {
             return false;
         };
@@ -104,7 +111,7 @@ impl Monitor {
     fn is_begun(
         &self,
         library: &Library,
-        at: u32,
+        at: SlotIndex,
         protocol: &str,
         by: impl Fn(&Holders<'_>) -> u32,
     ) -> bool {

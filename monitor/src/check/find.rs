@@ -4,12 +4,24 @@ use smallvec::SmallVec;
 
 use crate::Header;
 use crate::check::observed::ObservedMessage;
+use crate::conversation::Conversation;
+use crate::conversation::ids::SlotIndex;
 use crate::conversation::table::Slot;
-use crate::conversation::{Conversation, NONE};
 use crate::limits::MAX_ALIKE;
 use crate::monitor::Monitor;
 use crate::protocol::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::protocol::machine::{Machine, Scope, step};
+
+/// The part that the agents of a message take in a conversation, the least first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Rank {
+    /// The sender takes no part.
+    None,
+    /// The sender takes part.
+    Sender,
+    /// The sender and a receiver take part.
+    Both,
+}
 
 impl Monitor {
     /// Finds the conversation of a message among those with its identifier: the one in which sender and
@@ -19,7 +31,7 @@ impl Monitor {
         id: &str,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
-    ) -> Option<(u32, &Slot)> {
+    ) -> Option<(SlotIndex, &Slot)> {
         // One search: hashing the identifier is a large part of a check.
         let mut found = self.table.find_all(id);
         let first = found.next()?;
@@ -29,13 +41,13 @@ impl Monitor {
         let Some(second) = found.next() else {
             // Nearly all identifiers have one conversation.
             let (_, slot) = first;
-            if fits_role(slot) || self.rank(slot, sender, observed) == 2 {
+            if fits_role(slot) || self.rank(slot, sender, observed) == Rank::Both {
                 return Some(first);
             }
             return self.place_among(id, &[first], header, observed);
         };
         let alike = [first, second].into_iter().chain(found);
-        let alike: SmallVec<[(u32, &Slot); MAX_ALIKE]> = alike.collect();
+        let alike: SmallVec<[(SlotIndex, &Slot); MAX_ALIKE]> = alike.collect();
         let local = alike.iter().find(|(_, slot)| fits_role(slot)).copied();
         local.or_else(|| self.place_among(id, &alike, header, observed))
     }
@@ -46,20 +58,20 @@ impl Monitor {
     fn place_among<'s>(
         &self,
         id: &str,
-        alike: &[(u32, &'s Slot)],
+        alike: &[(SlotIndex, &'s Slot)],
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
-    ) -> Option<(u32, &'s Slot)> {
+    ) -> Option<(SlotIndex, &'s Slot)> {
         let sender = observed.undelivered_to.unwrap_or(observed.sender);
         // Of several, the last that began.
         let (at, slot) = *alike.iter().max_by_key(|(at, slot)| {
             let rank = self.rank(slot, sender, observed);
             // Other agents may take part in a conversation that began elsewhere.
-            let joined = rank == 0 && slot.conversation.joined;
+            let joined = rank == Rank::None && slot.conversation.joined;
             let has_protocol = self.has_protocol(*at, header, observed);
             (rank, joined, has_protocol, self.table.serial(*at), *at)
         })?;
-        if self.single || self.rank(slot, sender, observed) == 2 {
+        if self.single || self.rank(slot, sender, observed) == Rank::Both {
             return Some((at, slot));
         }
         if observed.undelivered_to.is_some() {
@@ -79,31 +91,33 @@ impl Monitor {
         stays.then_some((at, slot))
     }
 
-    /// 2 if the sender and a receiver take part in the conversation or in one within it, 1 if the
-    /// sender does.
+    /// The part that the sender and the receivers take in the conversation or in one within it.
     #[inline]
-    fn rank(&self, slot: &Slot, sender: &str, observed: &ObservedMessage<'_>) -> u8 {
+    fn rank(&self, slot: &Slot, sender: &str, observed: &ObservedMessage<'_>) -> Rank {
         match self.links(&slot.conversation, sender, observed) {
-            true => 2,
+            true => Rank::Both,
             false => self.rank_without_link(slot, sender, observed),
         }
     }
 
-    fn rank_without_link(&self, slot: &Slot, sender: &str, observed: &ObservedMessage<'_>) -> u8 {
-        let children = std::iter::successors(Some(slot.child), |at| Some(self.table.sibling(*at)));
+    fn rank_without_link(&self, slot: &Slot, sender: &str, observed: &ObservedMessage<'_>) -> Rank {
+        let children = std::iter::successors(slot.child, |at| self.table.sibling(*at));
         let children = children.map_while(|at| self.table.slot(at));
         let inner = || children.clone().map(|slot| &slot.conversation);
         let all = || inner().chain([&slot.conversation]);
         let sends = |conversation: &Conversation| self.sends_in(conversation, sender);
         let receives = |conversation: &Conversation| self.receives_in(conversation, observed);
-        let embeds = slot.child != NONE;
+        let embeds = slot.child.is_some();
         if embeds
             && (inner().any(|conversation| self.links(conversation, sender, observed))
                 || all().any(sends) && all().any(receives))
         {
-            return 2;
+            return Rank::Both;
         }
-        u8::from(all().any(sends))
+        match all().any(sends) {
+            true => Rank::Sender,
+            false => Rank::None,
+        }
     }
 
     /// Whether a message of this sender fits the agents of the conversation.
@@ -149,19 +163,26 @@ impl Monitor {
 
     /// Whether the protocol of a message is that of the conversation or of one within it, or may begin
     /// within it.
-    fn has_protocol(&self, at: u32, header: &Header<'_>, observed: &ObservedMessage<'_>) -> bool {
+    fn has_protocol(
+        &self,
+        at: SlotIndex,
+        header: &Header<'_>,
+        observed: &ObservedMessage<'_>,
+    ) -> bool {
         let Some(name) = header.protocol_name() else {
             return true;
         };
-        let mut part = at;
-        while let Some(slot) = self.table.slot(part) {
+        let mut next = Some(at);
+        while let Some(part) = next
+            && let Some(slot) = self.table.slot(part)
+        {
             let machine = self.machine_of(&self.library, part);
             if machine.is_some_and(|machine| machine.is_called(name))
                 || self.may_begin(&self.library, part, name, observed.sender)
             {
                 return true;
             }
-            part = if part == at {
+            next = if part == at {
                 slot.child
             } else {
                 self.table.sibling(part)
@@ -175,7 +196,7 @@ impl Monitor {
     /// conversation as a subprotocol, it does.
     pub(crate) fn is_cancel_of(
         &self,
-        main: u32,
+        main: SlotIndex,
         protocol: &str,
         sender: &str,
         act: Act<'_>,
@@ -186,8 +207,10 @@ impl Monitor {
         {
             return false;
         }
-        let mut part = main;
-        while let Some(slot) = self.table.slot(part) {
+        let mut next = Some(main);
+        while let Some(part) = next
+            && let Some(slot) = self.table.slot(part)
+        {
             let inner = part != main;
             let machine = self.machine_of(&self.library, part);
             if inner && machine.is_some_and(|machine| machine.is_called(protocol))
@@ -195,7 +218,7 @@ impl Monitor {
             {
                 return false;
             }
-            part = if inner {
+            next = if inner {
                 self.table.sibling(part)
             } else {
                 slot.child
@@ -205,10 +228,17 @@ impl Monitor {
     }
 
     /// Whether the first message of a protocol begins another conversation than this one.
-    fn begins_another(&self, at: u32, machine: &Machine, observed: &ObservedMessage<'_>) -> bool {
+    fn begins_another(
+        &self,
+        at: SlotIndex,
+        machine: &Machine,
+        observed: &ObservedMessage<'_>,
+    ) -> bool {
         let name = machine.name();
-        let mut part = at;
-        while let Some(slot) = self.table.slot(part) {
+        let mut next = Some(at);
+        while let Some(part) = next
+            && let Some(slot) = self.table.slot(part)
+        {
             let conversation = &slot.conversation;
             let initiates = part == at && self.names.is(conversation.initiator, observed.sender);
             let leads = !conversation.joined
@@ -216,7 +246,7 @@ impl Monitor {
             if leads || self.may_begin(&self.library, part, name, observed.sender) {
                 return false;
             }
-            part = if part == at {
+            next = if part == at {
                 slot.child
             } else {
                 self.table.sibling(part)

@@ -8,10 +8,11 @@ use fipa_acl::is_pattern;
 use crate::check::next_state::{NextState, PartyMessage, next_state};
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::Fault;
-use crate::conversation::names::{Name, Names};
+use crate::conversation::Conversation;
+use crate::conversation::ids::Name;
+use crate::conversation::names::Names;
 use crate::conversation::party::{Party, Side, side_index};
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, ELSEWHERE, FAILED};
-use crate::conversation::{Conversation, NONE};
 use crate::protocol::act::{FAILURE, INFORM};
 use crate::protocol::machine::{Cancel, Guard, Machine, Scope, step};
 use crate::verdict::ViolationKind as Kind;
@@ -116,7 +117,7 @@ impl Judge<'_> {
     /// Checks a message of the initiator, or of an agent that continues in its place. The latter can
     /// address only agents that already take part.
     fn by_initiator(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
-        let fresh = Party::new(NONE, self.machine.initial);
+        let fresh = Party::new(None, self.machine.initial);
         let conversation = self.conversation;
         let began =
             !conversation.joined && self.names.is(conversation.initiator, self.observed.sender);

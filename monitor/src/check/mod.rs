@@ -31,8 +31,8 @@ use crate::check::judge::{Move, judge};
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::{Denied, Fault, Passed};
 use crate::check::report::violation;
-use crate::conversation::NONE;
 use crate::conversation::deadlines::Deadline;
+use crate::conversation::ids::{PartyIndex, SlotIndex};
 use crate::conversation::state::{is_final, is_over, state_name};
 use crate::conversation::table::{List, Slot};
 use crate::limits::{MAX_DESIGNATED, MAX_TEXT};
@@ -159,7 +159,7 @@ impl Monitor {
             let Some(machine) = self.library.index_of(protocol) else {
                 return Err(self.unknown_protocol(protocol));
             };
-            return self.open(id, NONE, machine, header, &observed, now);
+            return self.open(id, None, machine, header, &observed, now);
         };
         let machine = self.library.machine(slot.conversation.machine);
         let follows = |name| {
@@ -220,7 +220,7 @@ impl Monitor {
     /// Checks a message in an existing conversation and updates the conversation.
     fn advance(
         &mut self,
-        at: u32,
+        at: SlotIndex,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
         now: Moment,
@@ -292,7 +292,7 @@ impl Monitor {
                 due: 0,
                 at,
                 generation: slot.generation,
-                party: 0,
+                party: PartyIndex::new(0),
             },
             now: now_ms,
             due,
@@ -334,7 +334,7 @@ impl Monitor {
         };
         let is_charged = slot.is_charged();
         // An embedded conversation is in no list, and one that is not complete is not over.
-        let is_main = slot.parent == NONE;
+        let is_main = slot.parent.is_none();
         if is_main && (passed.complete || !slot.touch(List::Open, now_ms)) {
             self.touch(at, now_ms);
         }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::{Denied, Passed};
-use crate::conversation::NONE;
+use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
 use crate::conversation::party::Party;
 use crate::monitor::Monitor;
@@ -16,7 +16,7 @@ impl Monitor {
     pub(crate) fn open(
         &mut self,
         id: &str,
-        parent: u32,
+        parent: Option<SlotIndex>,
         machine: u16,
         header: &Header<'_>,
         observed: &ObservedMessage<'_>,
@@ -27,7 +27,7 @@ impl Monitor {
             return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
         };
         // Checked before eviction, so that an invalid message evicts no conversation.
-        if parent == NONE
+        if parent.is_none()
             && let Some(projection) = protocol.projection.clone().filter(|_| self.agent.is_some())
         {
             let machine = (machine, protocol);
@@ -36,17 +36,17 @@ impl Monitor {
         let begins = step(&protocol.initial().steps, observed.act, u32::MAX, u32::MAX);
         let Some(begins) = begins else {
             return Err(match parent {
-                NONE => self.unopened(id, machine, protocol, header, observed, now),
-                _ => Denied::NotOpened(machine),
+                None => self.unopened(id, machine, protocol, header, observed, now),
+                Some(_) => Denied::NotOpened(machine),
             });
         };
         let at = self.insert(id, parent, machine, (header, observed), now)?;
-        let may_continue = parent == NONE && !self.is_certain(id);
+        let may_continue = parent.is_none() && !self.is_certain(id);
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;
-            conversation.initiator = conversation.acquire(&mut self.names, observed.sender);
+            conversation.initiator = Some(conversation.acquire(&mut self.names, observed.sender));
             if protocol.scope == Scope::Conversation {
-                let party = Party::new(NONE, protocol.initial);
+                let party = Party::new(None, protocol.initial);
                 conversation.parties.push(party);
             }
             if may_continue && protocol.may_repeat(observed.act, begins) {
@@ -70,26 +70,26 @@ impl Monitor {
     pub(crate) fn insert(
         &mut self,
         id: &str,
-        parent: u32,
+        parent: Option<SlotIndex>,
         machine: u16,
         (header, observed): (&Header<'_>, &ObservedMessage<'_>),
         now: Moment,
-    ) -> Result<u32, Denied> {
-        if parent == NONE {
+    ) -> Result<SlotIndex, Denied> {
+        if parent.is_none() {
             self.evict_alike(id)?;
         }
-        let peer = match self.table.slot(parent) {
-            Some(_) => self.names.acquire_again(self.table.peer(parent)),
-            None if observed.own => NONE,
+        let peer = match parent {
+            Some(parent) => {
+                let peer = self.table.peer(parent);
+                peer.map(|peer| self.names.acquire_again(peer))
+            }
+            None if observed.own => None,
             None => {
                 let peer = header.peer_name().unwrap_or(observed.sender);
-                self.names.acquire(peer)
+                Some(self.names.acquire(peer))
             }
         };
-        let peer_cost = match peer {
-            NONE => 0,
-            peer => Names::cost(self.names.text(peer).len()),
-        };
+        let peer_cost = peer.map_or(0, |peer| Names::cost(self.names.text(peer).len()));
         // Its bytes are charged, and others evicted for them, when the message has been accepted.
         self.evict(parent, peer, 1);
         let at = self.table.insert(id, parent, peer, machine, now.millis());
@@ -124,7 +124,7 @@ impl Monitor {
         }
         // The sender may have named the monitored agent in a `reply-to`, or the agent has restarted.
         if protocol.shows_initiator(observed.act) {
-            if let Err(denied) = self.join(id, NONE, machine, (header, observed), now) {
+            if let Err(denied) = self.join(id, None, machine, (header, observed), now) {
                 return denied;
             }
             return Denied::Unchecked(Unchecked::BegunElsewhere);

@@ -1,13 +1,14 @@
 //! The result of a check, before it becomes a verdict.
 
 use crate::conversation::Conversation;
+use crate::conversation::ids::SlotIndex;
 use crate::conversation::state::is_final;
 use crate::protocol::machine::Machine;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 
 /// The reason that a message was not accepted.
 pub(crate) enum Denied {
-    Fault(Fault, u32),
+    Fault(Fault, SlotIndex),
     NotOpened(u16),
     /// Refused without a conversation; with a similar protocol, if there is one.
     Refused(Kind, Option<u16>),

@@ -6,12 +6,13 @@ use std::sync::Arc;
 use crate::check::judge::unbound;
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::{Denied, Fault, Passed};
+use crate::conversation::Conversation;
 use crate::conversation::bindings::RoleBinding;
+use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
 use crate::conversation::party::{Party, act_number};
 use crate::conversation::rare::LastSent;
 use crate::conversation::state::AFTER_NOT_UNDERSTOOD;
-use crate::conversation::{Conversation, NONE};
 use crate::monitor::Monitor;
 use crate::protocol::act::{CANCEL, FAILURE, NOT_UNDERSTOOD};
 use crate::protocol::machine::Machine;
@@ -39,11 +40,11 @@ impl Monitor {
             });
         }
         let is_certain = self.is_certain(id);
-        let at = self.insert(id, NONE, index, (header, observed), now)?;
+        let at = self.insert(id, None, index, (header, observed), now)?;
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;
-            conversation.initiator = conversation.acquire(&mut self.names, observed.sender);
-            conversation.add(Party::new(NONE, machine.initial));
+            conversation.initiator = Some(conversation.acquire(&mut self.names, observed.sender));
+            conversation.add(Party::new(None, machine.initial));
             conversation.rare().local = Some(LocalRun::new(projection.locals(), u32::MAX));
             conversation.rare().may_continue = !is_certain;
         }
@@ -71,8 +72,8 @@ impl Monitor {
     /// message waits for its turn, the role of the monitored agent or that of another one is uncertain, or
     /// there is another conversation with this identifier. An agent that guesses an identifier can cause all
     /// but the first.
-    pub(crate) fn recheck_local(&self, id: &str, at: u32, denied: Denied) -> Denied {
-        let uncertain = |at: u32| {
+    pub(crate) fn recheck_local(&self, id: &str, at: SlotIndex, denied: Denied) -> Denied {
+        let uncertain = |at: SlotIndex| {
             let slot = self.table.slot(at);
             let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
             rare.is_some_and(|rare| {
@@ -125,7 +126,7 @@ impl Monitor {
     /// Checks a message in a conversation that the role of the agent sees.
     pub(crate) fn advance_local(
         &mut self,
-        at: u32,
+        at: SlotIndex,
         projection: &Projection,
         observed: &ObservedMessage<'_>,
         now: Moment,

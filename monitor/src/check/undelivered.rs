@@ -7,6 +7,7 @@ use smallvec::SmallVec;
 use crate::check::alternatives::any_state_of;
 use crate::check::roles::take_back_local;
 use crate::conversation::Conversation;
+use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
 use crate::conversation::party::{Side, act_number};
 use crate::limits::MAX_ALIKE;
@@ -28,7 +29,7 @@ impl Monitor {
         let library = Arc::clone(&self.library);
         let mains = self.table.find_all(id);
         let mains = mains.map(|(main, slot)| (main, slot.child));
-        let mains: SmallVec<[(u32, u32); MAX_ALIKE]> = mains.collect();
+        let mains: SmallVec<[(SlotIndex, Option<SlotIndex>); MAX_ALIKE]> = mains.collect();
         for (main, child) in mains {
             let (mut at, mut next) = (main, child);
             loop {
@@ -58,10 +59,10 @@ impl Monitor {
                     self.charge(at);
                     return;
                 }
-                if self.table.slot(next).is_none() {
+                let Some(child) = next else {
                     break;
-                }
-                (at, next) = (next, self.table.sibling(next));
+                };
+                (at, next) = (child, self.table.sibling(child));
             }
         }
     }

@@ -4,7 +4,7 @@ use std::ops::{Deref, Range};
 
 use smallvec::SmallVec;
 
-use crate::conversation::names::Name;
+use crate::conversation::ids::Name;
 
 /// A role and the agent that has it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -3,17 +3,19 @@
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
+use crate::conversation::ids::{PartyIndex, SlotIndex};
+
 /// The deadline of a message: its time, its conversation and its party.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Deadline {
     /// Milliseconds of the monotonic clock.
     pub(crate) due: u64,
     /// Slot of the conversation.
-    pub(crate) at: u32,
+    pub(crate) at: SlotIndex,
     /// Generation of the slot.
     pub(crate) generation: u32,
     /// Index of the party.
-    pub(crate) party: u32,
+    pub(crate) party: PartyIndex,
 }
 
 /// Deadlines, the earliest first. A stale deadline is removed when it is due, or when there are too
@@ -70,9 +72,9 @@ mod tests {
         let mut deadlines = Deadlines::default();
         let deadline = |due| Deadline {
             due,
-            at: 0,
+            at: SlotIndex::new(0),
             generation: 0,
-            party: 0,
+            party: PartyIndex::new(0),
         };
         for due in [7, 3, 5] {
             deadlines.push(deadline(due));
@@ -98,9 +100,9 @@ mod tests {
             for due in 0..more {
                 deadlines.push(Deadline {
                     due,
-                    at: 0,
+                    at: SlotIndex::new(0),
                     generation: 0,
-                    party: 0,
+                    party: PartyIndex::new(0),
                 });
             }
             if deadlines.are_many() {

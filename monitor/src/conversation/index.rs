@@ -3,7 +3,7 @@
 //! Linear probing reads one cache line for most searches. A table with separate control bytes reads two, and
 //! the address of the second line depends on the first.
 
-use crate::conversation::NONE;
+use crate::conversation::ids::SlotIndex;
 
 /// Hash table of conversations by a part of the fingerprint of their identifier. Several entries may have
 /// one tag.
@@ -17,14 +17,14 @@ pub(crate) struct Index {
     len: usize,
 }
 
-/// A tag and the slot of a conversation, or [`NONE`] for a free place.
+/// A tag and the slot of a conversation; none for a free place.
 #[derive(Debug, Clone, Copy)]
 struct Indexed {
     tag: u32,
-    at: u32,
+    at: Option<SlotIndex>,
 }
 
-const FREE: Indexed = Indexed { tag: 0, at: NONE };
+const FREE: Indexed = Indexed { tag: 0, at: None };
 
 /// Number of places of the smallest table.
 const FIRST: usize = 16;
@@ -35,26 +35,26 @@ impl Index {
 
     /// The slots of the entries with this tag.
     #[inline]
-    pub(crate) fn find_all(&self, tag: u32) -> impl Iterator<Item = u32> + '_ {
+    pub(crate) fn find_all(&self, tag: u32) -> impl Iterator<Item = SlotIndex> + '_ {
         self.run_of(tag)
             .filter(move |(_, one)| one.tag == tag)
-            .map(|(_, one)| one.at)
+            .filter_map(|(_, one)| one.at)
     }
 
-    pub(crate) fn insert(&mut self, tag: u32, at: u32) {
+    pub(crate) fn insert(&mut self, tag: u32, at: SlotIndex) {
         if self.len >= self.places.len() / 8 * 7 {
             let double = (self.places.len() * 2).max(FIRST);
             let before = std::mem::replace(&mut self.places, vec![FREE; double]);
-            for entry in before.into_iter().filter(|entry| entry.at != NONE) {
+            for entry in before.into_iter().filter(|entry| entry.at.is_some()) {
                 self.place(entry);
             }
         }
-        self.place(Indexed { tag, at });
+        self.place(Indexed { tag, at: Some(at) });
         self.len += 1;
     }
 
-    pub(crate) fn remove(&mut self, tag: u32, at: u32) {
-        let found = self.run_of(tag).find(|(_, one)| one.at == at);
+    pub(crate) fn remove(&mut self, tag: u32, at: SlotIndex) {
+        let found = self.run_of(tag).find(|(_, one)| one.at == Some(at));
         let Some((mut hole, _)) = found else {
             return;
         };
@@ -62,7 +62,7 @@ impl Index {
         for _ in 0..self.places.len() {
             let next = (hole + 1) & self.mask();
             let entry = self.places.get(next).copied().unwrap_or(FREE);
-            if entry.at == NONE || self.distance(entry, next) == 0 {
+            if entry.at.is_none() || self.distance(entry, next) == 0 {
                 break;
             }
             self.set(hole, entry);
@@ -78,7 +78,7 @@ impl Index {
         (0..self.places.len()).map_while(move |distance| {
             let at = (tag as usize).wrapping_add(distance) & self.mask();
             let entry = *self.places.get(at)?;
-            let is_over = entry.at == NONE || self.distance(entry, at) < distance;
+            let is_over = entry.at.is_none() || self.distance(entry, at) < distance;
             (!is_over).then_some((at, entry))
         })
     }
@@ -90,7 +90,7 @@ impl Index {
             let Some(resident) = self.places.get(at).copied() else {
                 return;
             };
-            if resident.at == NONE {
+            if resident.at.is_none() {
                 self.set(at, entry);
                 return;
             }
@@ -138,8 +138,8 @@ mod tests {
                 .map(|_| (rng.u32(0..4) << 20).wrapping_sub(rng.u32(0..homes)))
                 .collect();
             let mut index = Index::default();
-            let mut entries: Vec<(u32, u32)> = Vec::new();
-            for at in 0..2_000 {
+            let mut entries: Vec<(u32, SlotIndex)> = Vec::new();
+            for at in (0..2_000).map(SlotIndex::new) {
                 if rng.bool() && !entries.is_empty() {
                     let (tag, at) = entries.swap_remove(rng.usize(..entries.len()));
                     index.remove(tag, at);
@@ -149,12 +149,12 @@ mod tests {
                     entries.push((tag, at));
                 }
                 // Removes nothing.
-                index.remove(tags[0], NONE - 1);
+                index.remove(tags[0], SlotIndex::new(1 << 20));
                 assert_eq!(index.len, entries.len());
                 let tag = tags[rng.usize(..tags.len())];
-                let mut found: Vec<u32> = index.find_all(tag).collect();
+                let mut found: Vec<SlotIndex> = index.find_all(tag).collect();
                 let expected = entries.iter().filter(|(one, _)| *one == tag);
-                let mut expected: Vec<u32> = expected.map(|(_, at)| *at).collect();
+                let mut expected: Vec<SlotIndex> = expected.map(|(_, at)| *at).collect();
                 found.sort_unstable();
                 expected.sort_unstable();
                 assert_eq!(found, expected, "seed {seed}");
@@ -167,15 +167,15 @@ mod tests {
         let mut rng = Rng::with_seed(1);
         let mut index = Index::default();
         let tags: Vec<u32> = (0..(1 << 14) / 8 * 7).map(|_| rng.u32(..)).collect();
-        for (tag, at) in tags.iter().zip(0..) {
+        for (tag, at) in tags.iter().zip((0..).map(SlotIndex::new)) {
             index.insert(*tag, at);
         }
         assert_eq!(index.places.len(), 1 << 14);
         let read: usize = tags.iter().map(|tag| index.run_of(*tag).count()).sum();
         assert!(read < 6 * tags.len(), "{read} for {} searches", tags.len());
-        for (tag, at) in tags.iter().zip(0..) {
+        for (tag, at) in tags.iter().zip((0..).map(SlotIndex::new)) {
             index.remove(*tag, at);
         }
-        assert!(index.places.iter().all(|place| place.at == NONE));
+        assert!(index.places.iter().all(|place| place.at.is_none()));
     }
 }

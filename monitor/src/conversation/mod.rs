@@ -9,6 +9,7 @@
 pub(crate) mod bindings;
 pub(crate) mod deadlines;
 pub(crate) mod fingerprints;
+pub(crate) mod ids;
 mod index;
 pub(crate) mod memory;
 pub(crate) mod names;
@@ -21,14 +22,12 @@ pub(crate) mod table;
 use smallvec::SmallVec;
 
 use crate::conversation::bindings::{Bound, RoleBinding};
-use crate::conversation::names::{Name, Names, spread};
+use crate::conversation::ids::{Name, PartyIndex};
+use crate::conversation::names::{Names, spread};
 use crate::conversation::parties::Parties;
 use crate::conversation::party::Party;
 use crate::conversation::rare::Rare;
 use crate::limits::MAX_DESIGNATED;
-
-/// The absence of a name or an index.
-pub(crate) const NONE: u32 = u32::MAX;
 
 /// The order of the fields is that of the memory: see [`Slot`](crate::conversation::table::Slot).
 #[derive(Debug)]
@@ -39,7 +38,8 @@ pub(crate) struct Conversation {
     /// Whether the conversation began between other agents, and the monitored agent joined it because
     /// a `reply-to` names it. It then has the place of the initiator.
     pub(crate) joined: bool,
-    pub(crate) initiator: Name,
+    /// None for an unused slot.
+    pub(crate) initiator: Option<Name>,
     /// Bytes that the texts of the conversation are charged with: its identifier and its names.
     charged_texts: u32,
     /// Bytes with which the peer is charged.
@@ -58,7 +58,7 @@ impl Conversation {
         Self {
             machine: 0,
             joined: false,
-            initiator: NONE,
+            initiator: None,
             charged_texts: 0,
             cost: 0,
             rare: None,
@@ -112,11 +112,11 @@ impl Conversation {
             0 => 0,
             _ if count <= FEW => 0,
             // A table has a byte more for each place, is at most seven eighths full, and ends with a group.
-            _ => (count * 8 / 7).next_power_of_two() * (size_of::<(Name, u32)>() + 1) + 16,
+            _ => (count * 8 / 7).next_power_of_two() * (size_of::<(Name, PartyIndex)>() + 1) + 16,
         };
         let designated = match designated {
             0 => 0,
-            _ => MAX_DESIGNATED * size_of::<(u32, Name)>(),
+            _ => MAX_DESIGNATED * size_of::<(PartyIndex, Name)>(),
         };
         self.parties.growth(parties) + self.bound.growth(bindings) + rare + index + designated
     }
@@ -168,10 +168,10 @@ impl Conversation {
     }
 
     fn index(&mut self, at: usize) {
-        let Some(peer) = self.parties.get(at).map(|party| party.peer) else {
+        let Some(peer) = self.parties.get(at).and_then(|party| party.peer) else {
             return;
         };
-        let entry = (peer, u32::try_from(at).unwrap_or(NONE));
+        let entry = (peer, PartyIndex::new(at));
         let index = &mut self.rare().index;
         index.insert_unique(spread(peer), entry, |(peer, _)| spread(*peer));
     }
@@ -203,17 +203,17 @@ impl Conversation {
         let index = &self.rare.as_deref()?.index;
         let peer = names.known(agent)?;
         let (_, at) = index.find(spread(peer), |(known, _)| *known == peer)?;
-        usize::try_from(*at).ok()
+        Some(at.get())
     }
 
     /// Finds the participant in whose place an agent continues.
     fn delegating(&self, names: &Names, agent: &str) -> Option<usize> {
         let mut delegates = self.delegates().iter();
         let (at, _) = delegates.find(|(_, delegate)| names.is(*delegate, agent))?;
-        usize::try_from(*at).ok()
+        Some(at.get())
     }
 
-    pub(crate) fn delegates(&self) -> &[(u32, Name)] {
+    pub(crate) fn delegates(&self) -> &[(PartyIndex, Name)] {
         let rare = self.rare.as_deref();
         rare.map_or(&[], |rare| &rare.delegates)
     }
@@ -230,7 +230,7 @@ impl Conversation {
     /// Whether the agent has sent or received a message of this conversation, or may.
     pub(crate) fn takes_part(&self, names: &Names, agent: &str) -> bool {
         let bound = self.bound.iter().map(|bound| bound.agent);
-        let mut known = bound.chain([self.initiator]);
+        let mut known = bound.map(Some).chain([self.initiator]);
         self.party(names, agent).is_some() || known.any(|name| names.is(name, agent))
     }
 
@@ -260,7 +260,7 @@ mod tests {
     fn what_parties_allocate_is_counted_and_one_buffer_is_kept() {
         let mut names = Names::new(std::hash::RandomState::new());
         let mut conversation = Conversation::unused();
-        let party = Party::new(NONE, 0);
+        let party = Party::new(None, 0);
         conversation.add(party.clone());
         assert_eq!(conversation.allocated(), 0);
         let [first] = &mut conversation.parties[..] else {
@@ -288,12 +288,12 @@ mod tests {
         conversation.clear();
         assert_eq!(conversation.allocated(), 0);
         // The buffer of a single party serves the next one.
-        let mut single = Party::new(NONE, 0);
+        let mut single = Party::new(None, 0);
         single.ask(Side::Other, 9, "r9");
         conversation.add(single);
         conversation.clear();
         assert_eq!(conversation.allocated(), size_of::<Details>());
-        conversation.add(Party::new(NONE, 0));
+        conversation.add(Party::new(None, 0));
         assert_eq!(conversation.allocated(), size_of::<Details>());
         let party = conversation.parties.first().unwrap();
         assert_eq!((party.asked_text(1), party.earlier(1)), ("", &[0; EARLIER]));
@@ -303,8 +303,8 @@ mod tests {
     fn what_a_conversation_counts_is_what_it_allocates() {
         let mut conversation = Conversation::unused();
         let fill = |conversation: &mut Conversation| {
-            for agent in 0..20 {
-                conversation.add(Party::new(agent, 0));
+            for agent in (0..20).map(Name::new) {
+                conversation.add(Party::new(Some(agent), 0));
                 conversation.bound.push(RoleBinding { role: 0, agent });
             }
             for party in conversation.parties.iter_mut().take(7) {
@@ -313,15 +313,17 @@ mod tests {
             }
             // An uncertain one has two worlds.
             assert!(conversation.parties[0].take_back(Side::Initiator, 1, 7));
-            let mut unnamed = Party::new(NONE, 0);
+            let mut unnamed = Party::new(None, 0);
             unnamed.ask(Side::Initiator, 7, "r7");
             let rare = conversation.rare();
             rare.unnamed = Some(Box::new(unnamed));
-            rare.reply_to.extend(0..3);
-            rare.delegates.extend((0..5).map(|agent| (0, agent)));
-            rare.alternatives.extend((0..7).map(|state| (0, state)));
+            rare.reply_to.extend((0..3).map(Name::new));
+            let delegate = |agent| (PartyIndex::new(0), Name::new(agent));
+            rare.delegates.extend((0..5).map(delegate));
+            let party = Some(PartyIndex::new(0));
+            rare.alternatives.extend((0..7).map(|state| (party, state)));
             let asked = |agent| RoleBinding { role: 0, agent };
-            rare.asked.extend((0..3).map(asked));
+            rare.asked.extend((0..3).map(Name::new).map(asked));
             for receivers in [2, 9] {
                 rare.copied.push(Copied {
                     fingerprint: 0,
@@ -350,9 +352,9 @@ mod tests {
         let bytes = added(&|rare| rare.reply_to.reserve_exact(3));
         assert_eq!(bytes, 3 * size_of::<Name>());
         let bytes = added(&|rare| rare.delegates.reserve_exact(3));
-        assert_eq!(bytes, 3 * size_of::<(u32, Name)>());
+        assert_eq!(bytes, 3 * size_of::<(PartyIndex, Name)>());
         let bytes = added(&|rare| rare.alternatives.reserve_exact(3));
-        assert_eq!(bytes, 3 * size_of::<(u32, u16)>());
+        assert_eq!(bytes, 3 * size_of::<(Option<PartyIndex>, u16)>());
         let bytes = added(&|rare| rare.copied.reserve_exact(3));
         assert_eq!(bytes, 3 * size_of::<Copied>());
         for receivers in [3, 5] {
@@ -365,20 +367,23 @@ mod tests {
             });
             assert_eq!(bytes, receivers * size_of::<u64>());
         }
-        let asked = RoleBinding { role: 0, agent: 0 };
+        let agent = Name::new(0);
+        let asked = RoleBinding { role: 0, agent };
         assert_eq!(added(&|rare| rare.asked.push(asked)), 0);
         let bytes = added(&|rare| rare.asked.grow(5));
         assert_eq!(bytes, 5 * size_of::<RoleBinding>());
         let bytes = added(&|rare| {
-            let mut party = Party::new(NONE, 0);
+            let mut party = Party::new(None, 0);
             party.ask(Side::Initiator, 7, "r7");
             rare.unnamed = Some(Box::new(party));
         });
         assert_eq!(bytes, size_of::<Party>() + size_of::<Details>());
         let bytes = added(&|rare| {
-            rare.index.insert_unique(spread(1), (1, 0), |_| 0);
+            let name = Name::new(1);
+            let entry = (name, PartyIndex::new(0));
+            rare.index.insert_unique(spread(name), entry, |_| 0);
         });
-        assert!(bytes >= size_of::<(Name, u32)>());
+        assert!(bytes >= size_of::<(Name, PartyIndex)>());
     }
 
     #[test]
@@ -391,7 +396,7 @@ mod tests {
                 let mut grow = |conversation: &mut Conversation, numbers: Range<usize>| {
                     for number in numbers {
                         let agent = names.acquire(&number.to_string());
-                        conversation.add(Party::new(agent, 0));
+                        conversation.add(Party::new(Some(agent), 0));
                         conversation.bound.push(RoleBinding { role: 0, agent });
                     }
                 };
@@ -402,7 +407,10 @@ mod tests {
                     party.details();
                 }
                 for _ in 0..MAX_DESIGNATED {
-                    conversation.rare().delegates.push((0, 0));
+                    conversation
+                        .rare()
+                        .delegates
+                        .push((PartyIndex::new(0), Name::new(0)));
                 }
                 let allocated = conversation.allocated();
                 assert!(
@@ -425,11 +433,11 @@ mod tests {
     fn a_party_is_found_among_few_and_many() {
         let mut names = Names::new(std::hash::RandomState::new());
         let mut table = table::Table::new(&std::hash::RandomState::new());
-        let at = table.insert("c", NONE, NONE, 0, 1);
+        let at = table.insert("c", None, None, 0, 1);
         let conversation = &mut table.slot_mut(at).unwrap().conversation;
         for number in 0..40 {
             let peer = conversation.acquire(&mut names, &number.to_string());
-            conversation.add(Party::new(peer, 0));
+            conversation.add(Party::new(Some(peer), 0));
             for known in 0..=number {
                 let found = conversation.party(&names, &known.to_string());
                 assert_eq!(found.map(|(at, _)| at), Some(known));
@@ -437,7 +445,10 @@ mod tests {
             assert!(conversation.party(&names, "other").is_none());
         }
         let delegate = conversation.acquire(&mut names, "other");
-        conversation.rare().delegates.push((17, delegate));
+        conversation
+            .rare()
+            .delegates
+            .push((PartyIndex::new(17), delegate));
         assert_eq!(
             conversation.party(&names, "other").map(|(at, _)| at),
             Some(17)

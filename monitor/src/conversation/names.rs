@@ -4,8 +4,7 @@ use std::hash::{BuildHasher, RandomState};
 
 use hashbrown::HashTable;
 
-/// Index of a name in [`Names`].
-pub(crate) type Name = u32;
+use crate::conversation::ids::Name;
 
 /// Agent names with reference counts. A released entry is reused without allocating.
 #[derive(Debug)]
@@ -65,12 +64,12 @@ impl Names {
                     uses: 1,
                 });
                 // The number of conversations and participants bounds the number of entries.
-                Name::try_from(self.entries.len() - 1).unwrap_or(Name::MAX)
+                Name::new(self.entries.len() - 1)
             }
         };
         let (entries, hasher) = (&self.entries, &self.hasher);
         self.by_name.insert_unique(hash, index, |name| {
-            let entry = entries.get(*name as usize);
+            let entry = entries.get(name.get());
             hasher.hash_one(entry.map_or("", |entry| entry.name.as_str()))
         });
         index
@@ -85,7 +84,7 @@ impl Names {
     }
 
     pub(crate) fn release(&mut self, name: Name) {
-        let Some(entry) = self.entries.get_mut(name as usize) else {
+        let Some(entry) = self.entries.get_mut(name.get()) else {
             return;
         };
         entry.uses = entry.uses.saturating_sub(1);
@@ -104,15 +103,16 @@ impl Names {
     }
 
     #[inline]
-    pub(crate) fn is(&self, name: Name, text: &str) -> bool {
+    pub(crate) fn is(&self, name: impl Into<Option<Name>>, text: &str) -> bool {
         #[cfg(test)]
         COMPARISONS.with(|count| count.set(count.get() + 1));
-        let entry = self.entries.get(name as usize);
+        let entry = name.into().and_then(|name| self.entries.get(name.get()));
         entry.is_some_and(|entry| entry.name == text)
     }
 
-    pub(crate) fn text(&self, name: Name) -> &str {
-        let entry = self.entries.get(name as usize);
+    /// Text of a name; empty without one.
+    pub(crate) fn text(&self, name: impl Into<Option<Name>>) -> &str {
+        let entry = name.into().and_then(|name| self.entries.get(name.get()));
         entry.map_or("", |entry| entry.name.as_str())
     }
 
@@ -139,13 +139,13 @@ impl Names {
     }
 
     fn entry(&mut self, name: Name) -> Option<&mut Entry> {
-        self.entries.get_mut(name as usize)
+        self.entries.get_mut(name.get())
     }
 }
 
 /// A hash of a name. Names are small numbers that [`Names`] gives out, so it needs no key.
 pub(crate) fn spread(name: Name) -> u64 {
-    u64::from(name).wrapping_mul(0x9e37_79b9_7f4a_7c15)
+    (name.get() as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15)
 }
 
 #[cfg(test)]
@@ -194,7 +194,7 @@ mod tests {
             let mut names = Names::new(RandomState::new());
             let name = names.acquire(&"x".repeat(len));
             names.release(name);
-            let left = names.entries[name as usize].name.capacity();
+            let left = names.entries[name.get()].name.capacity();
             assert_eq!(left >= len, kept, "{len}: {left}");
         }
     }

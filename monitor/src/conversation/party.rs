@@ -2,7 +2,7 @@
 
 use fipa_acl::Performative;
 
-use crate::conversation::names::Name;
+use crate::conversation::ids::Name;
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FAILED};
 use crate::protocol::act::{Act, CANCEL};
 
@@ -11,8 +11,8 @@ use crate::protocol::act::{Act, CANCEL};
 #[derive(Debug, Clone)]
 #[repr(C)]
 pub(crate) struct Party {
-    /// The participant, or [`NONE`].
-    pub(crate) peer: Name,
+    /// The participant, if each has a state of its own.
+    pub(crate) peer: Option<Name>,
     pub(crate) state: u16,
     /// During a cancel, or after a failure or a not-understood: the state before it.
     pub(crate) resume: u16,
@@ -111,7 +111,7 @@ pub(crate) enum World {
 }
 
 impl Party {
-    pub(crate) fn new(peer: Name, state: u16) -> Self {
+    pub(crate) fn new(peer: Option<Name>, state: u16) -> Self {
         Self {
             peer,
             state,
@@ -403,7 +403,6 @@ pub(crate) fn standard_act(number: u8) -> Option<Act<'static>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::conversation::NONE;
 
     #[test]
     fn the_tail_of_a_text_has_whole_characters() {
@@ -432,7 +431,7 @@ mod tests {
     fn a_message_that_is_taken_back_leaves_those_before_it() {
         // Up to more than there are earlier ones.
         for count in 0..=8 {
-            let mut party = Party::new(NONE, 0);
+            let mut party = Party::new(None, 0);
             for asked in 1..=count {
                 party.ask(Side::Initiator, asked, "");
             }

@@ -4,7 +4,7 @@ use hashbrown::HashTable;
 use smallvec::SmallVec;
 
 use crate::conversation::bindings::RoleBinding;
-use crate::conversation::names::Name;
+use crate::conversation::ids::{Name, PartyIndex};
 use crate::conversation::party::Party;
 use crate::protocol::projection::LocalRun;
 
@@ -17,13 +17,13 @@ pub(crate) struct Rare {
     pub(crate) unnamed: Option<Box<Party>>,
     /// Agents that receive messages instead of a participant, and may continue in its place: the index
     /// of the party and the agent.
-    pub(crate) delegates: Vec<(u32, Name)>,
+    pub(crate) delegates: Vec<(PartyIndex, Name)>,
     /// Whether the conversation may have begun before the monitor.
     pub(crate) may_continue: bool,
     /// If it may, other states to which the first message to a party may have led: the index of the
-    /// party, or [`NONE`] for the members of a multicast, and the state. [`FAILED`] stands for any
+    /// party, or none for the members of a multicast, and the state. [`FAILED`] stands for any
     /// state: a message to the party was not delivered.
-    pub(crate) alternatives: Vec<(u32, u16)>,
+    pub(crate) alternatives: Vec<(Option<PartyIndex>, u16)>,
     /// The conversation as the role of the monitored agent sees it.
     pub(crate) local: Option<LocalRun>,
     /// Whether an agent has a role in it that the monitored agent knows only from a message of that agent.
@@ -45,7 +45,7 @@ pub(crate) struct Rare {
     /// The last messages of which an observer gets each copy by itself.
     pub(crate) copied: Vec<Copied>,
     /// The parties by their peers, if there are more than [`FEW`].
-    pub(crate) index: HashTable<(Name, u32)>,
+    pub(crate) index: HashTable<(Name, PartyIndex)>,
 }
 
 impl Rare {
@@ -56,8 +56,8 @@ impl Rare {
         size_of::<Self>()
             + self.reply_to.capacity() * size_of::<Name>()
             + unnamed.map_or(0, |party| size_of::<Party>() + party.allocated())
-            + self.delegates.capacity() * size_of::<(u32, Name)>()
-            + self.alternatives.capacity() * size_of::<(u32, u16)>()
+            + self.delegates.capacity() * size_of::<(PartyIndex, Name)>()
+            + self.alternatives.capacity() * size_of::<(Option<PartyIndex>, u16)>()
             + self.copied.capacity() * size_of::<Copied>()
             + copies
                 .map(|copied| 8 * copied.seen.capacity())

@@ -8,9 +8,10 @@ use std::hash::{BuildHasher, RandomState};
 use hashbrown::HashTable;
 use siphasher::sip128::SipHasher13;
 
+use crate::conversation::Conversation;
+use crate::conversation::ids::{Name, SlotIndex};
 use crate::conversation::index::Index;
-use crate::conversation::names::{Name, spread};
-use crate::conversation::{Conversation, NONE};
+use crate::conversation::names::spread;
 
 /// A list of conversations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,13 +26,21 @@ pub(crate) enum List {
 /// every message, this would be the largest cost of a check.
 const PRECISION: u16 = 1_000;
 
+/// The conversations among which a list is searched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Listed {
+    All,
+    /// Those of a peer; none for the monitored agent.
+    Peer(Option<Name>),
+}
+
 /// Conversations in slots. A free slot is reused without allocating.
 #[derive(Debug)]
 pub(crate) struct Table {
     slots: Slots,
     /// As many as slots.
     cold: Vec<Cold>,
-    free: Vec<u32>,
+    free: Vec<SlotIndex>,
     by_id: Index,
     keys: [u64; 2],
     /// The lists of all conversations.
@@ -53,7 +62,7 @@ struct Fingerprint {
 /// The conversations of one peer.
 #[derive(Debug)]
 struct Account {
-    peer: Name,
+    peer: Option<Name>,
     len: usize,
     bytes: usize,
     ends: [Ends; 2],
@@ -75,8 +84,8 @@ pub(crate) struct Slot {
     /// Number of conversations that have used the slot.
     pub(crate) generation: u32,
     /// First conversation embedded in this one.
-    pub(crate) child: u32,
-    pub(crate) parent: u32,
+    pub(crate) child: Option<SlotIndex>,
+    pub(crate) parent: Option<SlotIndex>,
     /// Time of the last message, in milliseconds of the monotonic clock.
     pub(crate) touched: u64,
     /// See [`Fingerprint`]; 0 for an embedded conversation.
@@ -91,9 +100,9 @@ struct Cold {
     /// Number of conversations that began before this one.
     serial: u64,
     /// Next conversation with the same parent.
-    sibling: u32,
-    /// The peer to which the conversation belongs, or [`NONE`] for the monitored agent.
-    peer: Name,
+    sibling: Option<SlotIndex>,
+    /// The peer to which the conversation belongs; none for the monitored agent.
+    peer: Option<Name>,
     /// Neighbors in the list of all conversations and in that of the peer.
     links: [Link; 2],
 }
@@ -109,13 +118,13 @@ struct Slots {
 const CHUNK: usize = 256;
 
 impl Slots {
-    fn get(&self, at: u32) -> Option<&Slot> {
-        let at = at as usize;
+    fn get(&self, at: SlotIndex) -> Option<&Slot> {
+        let at = at.get();
         self.chunks.get(at / CHUNK)?.get(at % CHUNK)
     }
 
-    fn get_mut(&mut self, at: u32) -> Option<&mut Slot> {
-        let at = at as usize;
+    fn get_mut(&mut self, at: SlotIndex) -> Option<&mut Slot> {
+        let at = at.get();
         self.chunks.get_mut(at / CHUNK)?.get_mut(at % CHUNK)
     }
 
@@ -124,28 +133,29 @@ impl Slots {
     }
 
     /// Adds a slot. Returns its index.
-    fn push(&mut self, slot: Slot) -> u32 {
+    fn push(&mut self, slot: Slot) -> SlotIndex {
         if self.chunks.last().is_none_or(|last| last.len() == CHUNK) {
             self.chunks.push(Vec::new());
         }
         let full = (self.chunks.len() - 1) * CHUNK;
-        let Some(last) = self.chunks.last_mut() else {
-            return NONE;
-        };
-        last.push(slot);
-        u32::try_from(full + last.len() - 1).unwrap_or(NONE)
+        let mut len = 0;
+        if let Some(last) = self.chunks.last_mut() {
+            len = last.len();
+            last.push(slot);
+        }
+        SlotIndex::new(full + len)
     }
 }
 
 #[derive(Debug, Clone, Copy)]
 struct Link {
-    older: u32,
-    newer: u32,
+    older: Option<SlotIndex>,
+    newer: Option<SlotIndex>,
 }
 
 const UNLINKED: Link = Link {
-    older: NONE,
-    newer: NONE,
+    older: None,
+    newer: None,
 };
 
 /// Index of the link in the list of all conversations.
@@ -156,13 +166,13 @@ const PEERS: usize = 1;
 
 #[derive(Debug, Clone, Copy)]
 struct Ends {
-    oldest: u32,
-    newest: u32,
+    oldest: Option<SlotIndex>,
+    newest: Option<SlotIndex>,
 }
 
 const EMPTY: Ends = Ends {
-    oldest: NONE,
-    newest: NONE,
+    oldest: None,
+    newest: None,
 };
 
 impl Slot {
@@ -227,8 +237,10 @@ impl Table {
     }
 
     /// Number and bytes of the conversations of a peer.
-    pub(crate) fn of_peer(&self, peer: Name) -> (usize, usize) {
-        let account = self.accounts.find(spread(peer), |one| one.peer == peer);
+    pub(crate) fn of_peer(&self, peer: Option<Name>) -> (usize, usize) {
+        let account = self
+            .accounts
+            .find(spread_peer(peer), |one| one.peer == peer);
         account.map_or((0, 0), |account| (account.len, account.bytes))
     }
 
@@ -237,7 +249,7 @@ impl Table {
     pub(crate) fn find_all<'t>(
         &'t self,
         id: &str,
-    ) -> impl Iterator<Item = (u32, &'t Slot)> + use<'t> {
+    ) -> impl Iterator<Item = (SlotIndex, &'t Slot)> + use<'t> {
         let Fingerprint { tag, rest } = self.fingerprint(id);
         let alike = self.by_id.find_all(tag);
         let alike = alike.filter_map(|at| Some((at, self.slot(at)?)));
@@ -255,101 +267,108 @@ impl Table {
     }
 
     #[cfg(test)]
-    pub(crate) fn find(&self, id: &str) -> Option<u32> {
+    pub(crate) fn find(&self, id: &str) -> Option<SlotIndex> {
         self.find_all(id).next().map(|(at, _)| at)
     }
 
     /// The main conversations: the time of the last message, the serial number and the slot.
-    pub(crate) fn mains(&self) -> impl Iterator<Item = (u64, u64, u32)> + '_ {
-        let used = (0..).zip(self.slots.iter()).filter(|(_, slot)| slot.used);
-        used.filter(|(_, slot)| slot.parent == NONE)
+    pub(crate) fn mains(&self) -> impl Iterator<Item = (u64, u64, SlotIndex)> + '_ {
+        let used = (0..)
+            .map(SlotIndex::new)
+            .zip(self.slots.iter())
+            .filter(|(_, slot)| slot.used);
+        used.filter(|(_, slot)| slot.parent.is_none())
             .map(|(at, slot)| (slot.touched, self.serial(at), at))
     }
 
-    pub(crate) fn slot(&self, at: u32) -> Option<&Slot> {
+    pub(crate) fn slot(&self, at: SlotIndex) -> Option<&Slot> {
         self.slots.get(at).filter(|slot| slot.used)
     }
 
-    pub(crate) fn slot_mut(&mut self, at: u32) -> Option<&mut Slot> {
+    pub(crate) fn slot_mut(&mut self, at: SlotIndex) -> Option<&mut Slot> {
         self.slots.get_mut(at).filter(|slot| slot.used)
     }
 
-    fn cold(&self, at: u32) -> Option<&Cold> {
-        self.cold.get(at as usize)
+    fn cold(&self, at: SlotIndex) -> Option<&Cold> {
+        self.cold.get(at.get())
     }
 
-    fn cold_mut(&mut self, at: u32) -> Option<&mut Cold> {
-        self.cold.get_mut(at as usize)
+    fn cold_mut(&mut self, at: SlotIndex) -> Option<&mut Cold> {
+        self.cold.get_mut(at.get())
     }
 
     /// Identifier of a conversation.
-    pub(crate) fn id(&self, at: u32) -> &str {
+    pub(crate) fn id(&self, at: SlotIndex) -> &str {
         self.cold(at).map_or("", |cold| &cold.id)
     }
 
     /// Number of conversations that began before this one.
-    pub(crate) fn serial(&self, at: u32) -> u64 {
+    pub(crate) fn serial(&self, at: SlotIndex) -> u64 {
         self.cold(at).map_or(0, |cold| cold.serial)
     }
 
-    /// The next conversation with the same parent, or [`NONE`].
-    pub(crate) fn sibling(&self, at: u32) -> u32 {
-        self.cold(at).map_or(NONE, |cold| cold.sibling)
+    /// The next conversation with the same parent, if there is one.
+    pub(crate) fn sibling(&self, at: SlotIndex) -> Option<SlotIndex> {
+        self.cold(at)?.sibling
     }
 
-    /// The peer to which a conversation belongs, or [`NONE`] for the monitored agent.
-    pub(crate) fn peer(&self, at: u32) -> Name {
-        self.cold(at).map_or(NONE, |cold| cold.peer)
+    /// The peer to which a conversation belongs, and none for the monitored agent.
+    pub(crate) fn peer(&self, at: SlotIndex) -> Option<Name> {
+        self.cold(at)?.peer
     }
 
-    pub(crate) fn oldest(&self, list: List) -> Option<u32> {
-        Some(self.ends[list as usize].oldest).filter(|at| *at != NONE)
+    pub(crate) fn oldest(&self, list: List) -> Option<SlotIndex> {
+        self.ends[list as usize].oldest
     }
 
     /// The least recently active conversation of a peer in a list.
-    pub(crate) fn oldest_of(&self, peer: Name, list: List) -> Option<u32> {
-        let account = self.accounts.find(spread(peer), |one| one.peer == peer);
-        account
-            .map(|account| account.ends[list as usize].oldest)
-            .filter(|at| *at != NONE)
+    pub(crate) fn oldest_of(&self, peer: Option<Name>, list: List) -> Option<SlotIndex> {
+        let account = self
+            .accounts
+            .find(spread_peer(peer), |one| one.peer == peer);
+        account?.ends[list as usize].oldest
     }
 
-    /// The least recently active conversation in a list except `keep`, of a peer if one is given. A list is
+    /// The least recently active conversation in a list except `keep`. A list is
     /// not sorted within [`PRECISION`], so `keep` may be the first in it.
-    pub(crate) fn oldest_but(&self, keep: u32, peer: Option<Name>, list: List) -> Option<u32> {
-        let (oldest, kind) = match peer {
-            Some(peer) => (self.oldest_of(peer, list)?, PEERS),
-            None => (self.oldest(list)?, ALL),
+    pub(crate) fn oldest_but(
+        &self,
+        keep: Option<SlotIndex>,
+        of: Listed,
+        list: List,
+    ) -> Option<SlotIndex> {
+        let (oldest, kind) = match of {
+            Listed::Peer(peer) => (self.oldest_of(peer, list)?, PEERS),
+            Listed::All => (self.oldest(list)?, ALL),
         };
-        if oldest != keep {
+        if Some(oldest) != keep {
             return Some(oldest);
         }
-        let newer = self.cold(keep)?.links[kind].newer;
-        Some(newer).filter(|at| *at != NONE)
+        self.cold(oldest)?.links[kind].newer
     }
 
-    /// Inserts a new conversation of this peer, with a parent or [`NONE`]. The caller holds a reference
+    /// Inserts a new conversation of this peer, with a parent or none. The caller holds a reference
     /// to the name of the peer for it.
     pub(crate) fn insert(
         &mut self,
         id: &str,
-        parent: u32,
-        peer: Name,
+        parent: Option<SlotIndex>,
+        peer: Option<Name>,
         machine: u16,
         now: u64,
-    ) -> u32 {
+    ) -> SlotIndex {
         let at = self.free_slot();
         if let Some(slot) = self.slots.get_mut(at) {
             slot.used = true;
             slot.generation = slot.generation.wrapping_add(1);
             (slot.touched, slot.id_rest) = (now, 0);
-            (slot.child, slot.parent) = (NONE, parent);
+            (slot.child, slot.parent) = (None, parent);
             slot.conversation.machine = machine;
         }
-        if let Some(cold) = self.cold.get_mut(at as usize) {
+        if let Some(cold) = self.cold.get_mut(at.get()) {
             cold.id.push_str(id);
             let capacity = cold.id.capacity();
-            (cold.serial, cold.sibling, cold.peer) = (self.begun, NONE, peer);
+            (cold.serial, cold.sibling, cold.peer) = (self.begun, None, peer);
             if let Some(slot) = self.slots.get_mut(at) {
                 slot.conversation.charge(capacity);
             }
@@ -357,28 +376,28 @@ impl Table {
         self.len += 1;
         self.begun += 1;
         self.account(peer).len += 1;
-        if parent == NONE {
+        if let Some(parent) = parent {
+            let first = self.slot(parent).and_then(|slot| slot.child);
+            if let Some(cold) = self.cold_mut(at) {
+                cold.sibling = first;
+            }
+            if let Some(slot) = self.slot_mut(parent) {
+                slot.child = Some(at);
+            }
+        } else {
             let Fingerprint { tag, rest } = self.fingerprint(id);
             if let Some(slot) = self.slots.get_mut(at) {
                 slot.id_rest = rest;
             }
             self.by_id.insert(tag, at);
             self.append(at, List::Open);
-        } else {
-            let first = self.slot(parent).map_or(NONE, |slot| slot.child);
-            if let Some(cold) = self.cold_mut(at) {
-                cold.sibling = first;
-            }
-            if let Some(slot) = self.slot_mut(parent) {
-                slot.child = at;
-            }
         }
         self.charge(at);
         at
     }
 
     /// Charges the peer of a conversation with its present size. Returns whether it has grown.
-    pub(crate) fn charge(&mut self, at: u32) -> bool {
+    pub(crate) fn charge(&mut self, at: SlotIndex) -> bool {
         let Some(slot) = self.slot_mut(at) else {
             return false;
         };
@@ -395,10 +414,12 @@ impl Table {
         cost > before
     }
 
-    fn account(&mut self, peer: Name) -> &mut Account {
-        let entry =
-            self.accounts
-                .entry(spread(peer), |one| one.peer == peer, |one| spread(one.peer));
+    fn account(&mut self, peer: Option<Name>) -> &mut Account {
+        let entry = self.accounts.entry(
+            spread_peer(peer),
+            |one| one.peer == peer,
+            |one| spread_peer(one.peer),
+        );
         entry
             .or_insert(Account {
                 peer,
@@ -409,15 +430,15 @@ impl Table {
             .into_mut()
     }
 
-    fn free_slot(&mut self) -> u32 {
+    fn free_slot(&mut self) -> SlotIndex {
         if let Some(at) = self.free.pop() {
             return at;
         }
         self.cold.push(Cold {
             id: String::new(),
             serial: 0,
-            sibling: NONE,
-            peer: NONE,
+            sibling: None,
+            peer: None,
             links: [UNLINKED; 2],
         });
         self.slots.push(Slot {
@@ -425,8 +446,8 @@ impl Table {
             list: List::Open,
             since_listed: 0,
             generation: 0,
-            child: NONE,
-            parent: NONE,
+            child: None,
+            parent: None,
             touched: 0,
             id_rest: 0,
             conversation: Conversation::unused(),
@@ -434,7 +455,7 @@ impl Table {
     }
 
     /// Updates the time and the list of a main conversation.
-    pub(crate) fn touch(&mut self, at: u32, list: List, now: u64) {
+    pub(crate) fn touch(&mut self, at: SlotIndex, list: List, now: u64) {
         let Some(slot) = self.slot_mut(at) else {
             return;
         };
@@ -447,24 +468,24 @@ impl Table {
     }
 
     /// Frees a slot without children. The caller must release its names first.
-    pub(crate) fn remove(&mut self, at: u32) {
+    pub(crate) fn remove(&mut self, at: SlotIndex) {
         let Some(slot) = self.slot(at) else {
             return;
         };
         let (parent, cost) = (slot.parent, slot.conversation.cost as usize);
         let peer = self.peer(at);
-        if parent == NONE {
+        if let Some(parent) = parent {
+            self.leave_parent(at, parent);
+        } else {
             let Fingerprint { tag, .. } = self.fingerprint(self.id(at));
             self.by_id.remove(tag, at);
             self.unlink(at);
-        } else {
-            self.leave_parent(at, parent);
         }
         if let Some(slot) = self.slots.get_mut(at) {
             slot.used = false;
             slot.conversation.clear();
         }
-        if let Some(cold) = self.cold.get_mut(at as usize) {
+        if let Some(cold) = self.cold.get_mut(at.get()) {
             cold.id.clear();
             // Large buffers are not kept for reuse.
             if cold.id.capacity() > KEPT {
@@ -480,19 +501,19 @@ impl Table {
         if account.len == 0
             && let Ok(found) = self
                 .accounts
-                .find_entry(spread(peer), |one| one.peer == peer)
+                .find_entry(spread_peer(peer), |one| one.peer == peer)
         {
             found.remove();
         }
     }
 
-    fn leave_parent(&mut self, at: u32, parent: u32) {
+    fn leave_parent(&mut self, at: SlotIndex, parent: SlotIndex) {
         let next = self.sibling(at);
         let mut before = None;
-        let mut current = self.slot(parent).map_or(NONE, |slot| slot.child);
-        while current != NONE && current != at {
-            before = Some(current);
-            current = self.sibling(current);
+        let mut current = self.slot(parent).and_then(|slot| slot.child);
+        while let Some(child) = current.filter(|child| *child != at) {
+            before = Some(child);
+            current = self.sibling(child);
         }
         match before {
             None => {
@@ -508,7 +529,7 @@ impl Table {
         }
     }
 
-    fn append(&mut self, at: u32, list: List) {
+    fn append(&mut self, at: SlotIndex, list: List) {
         let Some(slot) = self.slot_mut(at) else {
             return;
         };
@@ -520,18 +541,18 @@ impl Table {
             if let Some(cold) = self.cold_mut(at) {
                 cold.links[kind] = Link {
                     older: newest,
-                    newer: NONE,
+                    newer: None,
                 };
             }
-            match self.cold_mut(newest) {
-                Some(cold) => cold.links[kind].newer = at,
-                None => self.ends_of(kind, peer, list).oldest = at,
+            match newest.and_then(|newest| self.cold_mut(newest)) {
+                Some(cold) => cold.links[kind].newer = Some(at),
+                None => self.ends_of(kind, peer, list).oldest = Some(at),
             }
-            self.ends_of(kind, peer, list).newest = at;
+            self.ends_of(kind, peer, list).newest = Some(at);
         }
     }
 
-    fn unlink(&mut self, at: u32) {
+    fn unlink(&mut self, at: SlotIndex) {
         let Some(slot) = self.slot(at) else {
             return;
         };
@@ -542,24 +563,29 @@ impl Table {
         let (peer, links) = (*peer, *links);
         for kind in [ALL, PEERS] {
             let Link { older, newer } = links[kind];
-            match self.cold_mut(older) {
+            match older.and_then(|older| self.cold_mut(older)) {
                 Some(cold) => cold.links[kind].newer = newer,
                 None => self.ends_of(kind, peer, list).oldest = newer,
             }
-            match self.cold_mut(newer) {
+            match newer.and_then(|newer| self.cold_mut(newer)) {
                 Some(cold) => cold.links[kind].older = older,
                 None => self.ends_of(kind, peer, list).newest = older,
             }
         }
     }
 
-    fn ends_of(&mut self, kind: usize, peer: Name, list: List) -> &mut Ends {
+    fn ends_of(&mut self, kind: usize, peer: Option<Name>, list: List) -> &mut Ends {
         let ends = match kind {
             ALL => &mut self.ends,
             _ => &mut self.account(peer).ends,
         };
         &mut ends[list as usize]
     }
+}
+
+/// A hash of a peer, or of the monitored agent.
+fn spread_peer(peer: Option<Name>) -> u64 {
+    peer.map_or(u64::MAX, spread)
 }
 
 /// Maximum capacity of the buffer for the identifier of a free slot, in bytes.
@@ -569,6 +595,10 @@ const KEPT: usize = 128;
 mod tests {
     use super::*;
 
+    fn peer(number: usize) -> Option<Name> {
+        Some(Name::new(number))
+    }
+
     fn order(table: &Table, list: List) -> Vec<String> {
         let mut names = Vec::new();
         let mut at = table.oldest(list);
@@ -577,7 +607,7 @@ mod tests {
                 break;
             };
             names.push(cold.id.clone());
-            at = Some(cold.links[ALL].newer);
+            at = cold.links[ALL].newer;
         }
         names
     }
@@ -585,7 +615,7 @@ mod tests {
     #[test]
     fn conversations_are_listed_by_age_and_slots_are_reused() {
         let mut table = Table::new(&RandomState::new());
-        let [a, b, c] = ["a", "b", "c"].map(|id| table.insert(id, NONE, 7, 0, 1));
+        let [a, b, c] = ["a", "b", "c"].map(|id| table.insert(id, None, peer(7), 0, 1));
         assert_eq!(order(&table, List::Open), ["a", "b", "c"]);
         table.touch(a, List::Open, 2_000);
         assert_eq!(order(&table, List::Open), ["b", "c", "a"]);
@@ -603,7 +633,7 @@ mod tests {
         assert_eq!(order(&table, List::Open), ["b", "c"]);
         table.remove(b);
         assert_eq!((table.find("b"), table.find("c")), (None, Some(c)));
-        assert_eq!(table.insert("d", NONE, 7, 0, 6_000), b);
+        assert_eq!(table.insert("d", None, peer(7), 0, 6_000), b);
         assert_eq!(order(&table, List::Open), ["c", "d"]);
         assert_eq!(table.len(), 3);
     }
@@ -611,7 +641,7 @@ mod tests {
     #[test]
     fn a_conversation_moves_in_its_list_at_most_once_a_second() {
         let mut table = Table::new(&RandomState::new());
-        let [a, _] = ["a", "b"].map(|id| table.insert(id, NONE, 7, 0, 1));
+        let [a, _] = ["a", "b"].map(|id| table.insert(id, None, peer(7), 0, 1));
         for now in [400, 800, 1_000] {
             table.touch(a, List::Open, now);
             assert_eq!(order(&table, List::Open), ["a", "b"], "{now}");
@@ -630,23 +660,23 @@ mod tests {
     #[test]
     fn each_peer_has_a_list_and_is_charged() {
         let mut table = Table::new(&RandomState::new());
-        let a = table.insert("a", NONE, 1, 0, 1);
-        let b = table.insert("b", NONE, 2, 0, 2);
-        let c = table.insert("a", NONE, 1, 0, 3);
-        let child = table.insert("a", c, 1, 0, 3);
+        let a = table.insert("a", None, peer(1), 0, 1);
+        let b = table.insert("b", None, peer(2), 0, 2);
+        let c = table.insert("a", None, peer(1), 0, 3);
+        let child = table.insert("a", Some(c), peer(1), 0, 3);
         assert_eq!(table.find_all("a").count(), 2);
-        assert_eq!(table.oldest_of(1, List::Open), Some(a));
-        assert_eq!(table.oldest_of(2, List::Open), Some(b));
-        assert_eq!(table.oldest_of(3, List::Open), None);
+        assert_eq!(table.oldest_of(peer(1), List::Open), Some(a));
+        assert_eq!(table.oldest_of(peer(2), List::Open), Some(b));
+        assert_eq!(table.oldest_of(peer(3), List::Open), None);
         table.touch(a, List::Ended, 5_000);
-        assert_eq!(table.oldest_of(1, List::Open), Some(c));
-        assert_eq!(table.oldest_of(1, List::Ended), Some(a));
-        let (count, bytes) = table.of_peer(1);
+        assert_eq!(table.oldest_of(peer(1), List::Open), Some(c));
+        assert_eq!(table.oldest_of(peer(1), List::Ended), Some(a));
+        let (count, bytes) = table.of_peer(peer(1));
         assert_eq!(count, 3);
-        assert_eq!(bytes + table.of_peer(2).1, table.bytes());
+        assert_eq!(bytes + table.of_peer(peer(2)).1, table.bytes());
         table.slot_mut(a).unwrap().conversation.charge(500);
         table.charge(a);
-        assert_eq!(table.of_peer(1), (3, bytes + 500));
+        assert_eq!(table.of_peer(peer(1)), (3, bytes + 500));
         for at in [child, c, a, b] {
             table.remove(at);
         }
@@ -659,8 +689,10 @@ mod tests {
         use std::collections::HashSet;
 
         // The tables use the upper and the lower bits of a hash.
-        let lower: HashSet<u64> = (0..256).map(|name| spread(name) & 0xff).collect();
-        let upper: HashSet<u64> = (0..256).map(|name| spread(name) >> 57).collect();
+        let lower: HashSet<u64> = (0..256)
+            .map(|name| spread(Name::new(name)) & 0xff)
+            .collect();
+        let upper: HashSet<u64> = (0..256).map(|name| spread(Name::new(name)) >> 57).collect();
         assert_eq!((lower.len(), upper.len()), (256, 128));
         let table = Table::new(&RandomState::new());
         let tags = (0..256).map(|number: u32| table.fingerprint(&number.to_string()).tag);
@@ -672,9 +704,9 @@ mod tests {
     fn buffers_of_long_ids_are_not_kept() {
         for (len, kept) in [(100, true), (128, true), (129, false), (1_000, false)] {
             let mut table = Table::new(&RandomState::new());
-            let at = table.insert(&"x".repeat(len), NONE, 7, 0, 1);
+            let at = table.insert(&"x".repeat(len), None, peer(7), 0, 1);
             table.remove(at);
-            let left = table.cold[at as usize].id.capacity();
+            let left = table.cold[at.get()].id.capacity();
             assert_eq!(left >= len, kept, "{len}: {left}");
         }
     }
@@ -691,28 +723,28 @@ mod tests {
     fn slots_are_found_in_all_chunks() {
         let mut table = Table::new(&RandomState::new());
         let ids: Vec<String> = (0..3 * CHUNK).map(|number| number.to_string()).collect();
-        for (at, id) in (0..).zip(&ids) {
-            assert_eq!(table.insert(id, NONE, 7, 0, 1), at);
+        for (at, id) in (0..).map(SlotIndex::new).zip(&ids) {
+            assert_eq!(table.insert(id, None, peer(7), 0, 1), at);
         }
-        for (at, id) in (0..).zip(&ids) {
+        for (at, id) in (0..).map(SlotIndex::new).zip(&ids) {
             assert_eq!(table.id(at), id);
             assert_eq!(table.find(id), Some(at));
         }
-        assert!(table.slot(u32::try_from(ids.len()).unwrap()).is_none());
-        assert!(table.slot(NONE).is_none());
+        assert!(table.slot(SlotIndex::new(ids.len())).is_none());
+        assert!(table.slot(SlotIndex::new(usize::MAX)).is_none());
     }
 
     #[test]
     fn embedded_conversations_are_linked_to_their_parent() {
         let mut table = Table::new(&RandomState::new());
-        let main = table.insert("main", NONE, 7, 0, 1);
-        let children = [0; 3].map(|_| table.insert("main", main, 7, 1, 1));
+        let main = table.insert("main", None, peer(7), 0, 1);
+        let children = [0; 3].map(|_| table.insert("main", Some(main), peer(7), 1, 1));
         let chain = |table: &Table| {
             let mut found = Vec::new();
             let mut at = table.slot(main).unwrap().child;
-            while at != NONE {
-                found.push(at);
-                at = table.sibling(at);
+            while let Some(child) = at {
+                found.push(child);
+                at = table.sibling(child);
             }
             found
         };
@@ -721,7 +753,7 @@ mod tests {
         assert_eq!(chain(&table), [children[2], children[0]]);
         table.remove(children[2]);
         table.remove(children[0]);
-        assert_eq!(chain(&table), Vec::<u32>::new());
+        assert_eq!(chain(&table), Vec::<SlotIndex>::new());
         assert_eq!(table.find("main"), Some(main));
     }
 }

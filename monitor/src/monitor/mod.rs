@@ -10,6 +10,7 @@ use std::time::UNIX_EPOCH;
 use crate::check::judge::Move;
 use crate::conversation::deadlines::Deadlines;
 use crate::conversation::fingerprints::Fingerprints;
+use crate::conversation::ids::SlotIndex;
 use crate::conversation::memory::{Refused, Removed};
 use crate::conversation::names::Names;
 use crate::conversation::table::Table;
@@ -210,7 +211,11 @@ impl Monitor {
         self.removed.add(self.hasher.hash_one(id));
     }
 
-    pub(crate) fn machine_of<'l>(&self, library: &'l Library, at: u32) -> Option<&'l Machine> {
+    pub(crate) fn machine_of<'l>(
+        &self,
+        library: &'l Library,
+        at: SlotIndex,
+    ) -> Option<&'l Machine> {
         library.machine(self.table.slot(at)?.conversation.machine)
     }
 }
@@ -277,7 +282,7 @@ mod tests {
         say("agree ben>ann", "fipa-request", "2", now + 20 * hour);
         let held = |monitor: &Monitor, name| {
             let name = monitor.names.known(name);
-            name.map(|name| monitor.table.of_peer(name).0)
+            name.map(|name| monitor.table.of_peer(Some(name)).0)
         };
         let both = |monitor: &Monitor| ["zed", "ann"].map(|name| held(monitor, name));
         assert_eq!(both(&monitor), [Some(1), Some(5)]);

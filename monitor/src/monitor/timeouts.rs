@@ -5,8 +5,8 @@ use std::time::{Duration, SystemTime};
 use crate::Moment;
 use crate::check::apply::expire_party;
 use crate::clock::span_millis;
-use crate::conversation::NONE;
 use crate::conversation::deadlines::Deadline;
+use crate::conversation::ids::SlotIndex;
 use crate::conversation::party::Party;
 use crate::conversation::state::{FAILED, is_final, is_over, state_name};
 use crate::conversation::table::{List, Slot};
@@ -91,7 +91,7 @@ impl Monitor {
             return None;
         }
         let machine = self.library.machine(slot.conversation.machine)?;
-        let party = slot.conversation.parties.get_mut(deadline.party as usize)?;
+        let party = slot.conversation.parties.get_mut(deadline.party.get())?;
         // A later message has set another deadline or none.
         if party.deadline != deadline.due || is_over(machine, party.state) {
             return None;
@@ -108,11 +108,7 @@ impl Monitor {
             state: state_name(machine, before).to_owned(),
             next,
         };
-        let main = match parent {
-            NONE => deadline.at,
-            parent => parent,
-        };
-        self.touch(main, touched);
+        self.touch(parent.unwrap_or(deadline.at), touched);
         complete.then_some(event)
     }
 
@@ -122,14 +118,14 @@ impl Monitor {
             let slot = table.slot(deadline.at);
             let slot = slot.filter(|slot| slot.generation == deadline.generation);
             let parties = slot.map(|slot| &slot.conversation.parties);
-            let party = parties.and_then(|parties| parties.get(deadline.party as usize));
+            let party = parties.and_then(|parties| parties.get(deadline.party.get()));
             party.is_some_and(|party| party.deadline == deadline.due)
         };
         self.deadlines.remove_stale(counts);
     }
 
     /// Updates the time and the list of a main conversation.
-    pub(crate) fn touch(&mut self, at: u32, now: u64) {
+    pub(crate) fn touch(&mut self, at: SlotIndex, now: u64) {
         let library = &self.library;
         let over = |slot: &Slot| {
             let conversation = &slot.conversation;
@@ -145,9 +141,12 @@ impl Monitor {
         };
         let mut all_over = over(slot);
         let mut child = slot.child;
-        while all_over && let Some(slot) = self.table.slot(child) {
+        while all_over
+            && let Some(at) = child
+            && let Some(slot) = self.table.slot(at)
+        {
             all_over = over(slot);
-            child = self.table.sibling(child);
+            child = self.table.sibling(at);
         }
         let list = if all_over { List::Ended } else { List::Open };
         self.table.touch(at, list, now);
