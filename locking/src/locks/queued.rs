@@ -6,8 +6,10 @@
 //! * A request whose owner is lost waits for its return, up to [`Options::discovery`](crate::Options::discovery). The
 //!   owner then gets it again, with its place.
 
-use super::{Actions, Current, Locks, Phase};
-use crate::locks::{Action, ClaimId, Event, Failure};
+use super::claim::ClaimId;
+use super::event::{Action, Event, Failure};
+use super::request::{Current, Phase};
+use super::{Actions, Locks};
 use crate::{
     Act, Algorithm, Content, Conversation, LockDialect, LockMessage, LockPeer, Millis,
     MutualExclusion, Refusal, Resource,
