@@ -86,7 +86,8 @@ pub(crate) fn keep_alternatives(
     machine: &Machine,
     conversation: &mut Conversation,
     observed: &ObservedMessage<'_>,
-    (moves, before): (&[Move], PartiesBefore),
+    moves: &[Move],
+    before: PartiesBefore,
 ) {
     let count = conversation.parties.len();
     let Some(rare) = conversation.rare.as_deref_mut() else {

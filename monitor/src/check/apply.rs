@@ -1,8 +1,10 @@
 //! Changes of a conversation by an accepted message or by a timeout.
 
-use crate::Header;
+use crate::check::alternatives::{PartiesBefore, keep_alternatives};
+use crate::check::copies::{CopyKey, keep_copied};
 use crate::check::judge::{Move, MoveTarget, unbound};
 use crate::check::observed::ObservedMessage;
+use crate::check::outcome::Passed;
 use crate::clock::span_millis;
 use crate::conversation::Conversation;
 use crate::conversation::bindings::RoleBinding;
@@ -48,7 +50,45 @@ pub(crate) struct Change<'a> {
 }
 
 impl Change<'_> {
-    pub(crate) fn make(&mut self, conversation: &mut Conversation, made: &Move) {
+    /// Makes the moves, and returns the result. `copy` is the copy of the message for one receiver.
+    #[inline]
+    pub(crate) fn apply(
+        mut self,
+        conversation: &mut Conversation,
+        moves: &[Move],
+        copy: Option<CopyKey>,
+    ) -> Passed {
+        let before = PartiesBefore::of(conversation, self.machine);
+        for party_move in moves {
+            if self.machine.scope == Scope::Conversation {
+                self.bind(conversation, party_move.next_state.roles);
+            }
+            self.make(conversation, party_move);
+        }
+        if !self.observed.reply_to.is_empty() {
+            if self.names_designated(conversation, moves) {
+                self.designate(conversation);
+            } else {
+                self.delegate(conversation, moves);
+            }
+        }
+        if let Some((copy, first)) = copy.zip(moves.first()) {
+            keep_copied(conversation, copy, first.next_state.roles);
+        }
+        if let Some(before) = before {
+            keep_alternatives(self.machine, conversation, self.observed, moves, before);
+        }
+        let passed = Passed::in_state_of(conversation, self.machine, conversation.machine);
+        Passed {
+            state: self.state.unwrap_or(passed.state),
+            opened: self.opened,
+            late: self.late,
+            void: self.void,
+            ..passed
+        }
+    }
+
+    fn make(&mut self, conversation: &mut Conversation, made: &Move) {
         let fresh = |peer| Party::new(peer, self.machine.initial);
         let index = match made.target {
             MoveTarget::Party(index) => index,
@@ -157,7 +197,7 @@ impl Change<'_> {
     }
 
     /// Binds free roles of a step to the sender and the receivers.
-    pub(crate) fn bind(&mut self, conversation: &mut Conversation, (from, to): (u32, u32)) {
+    fn bind(&mut self, conversation: &mut Conversation, (from, to): (u32, u32)) {
         let free = unbound(self.machine, conversation);
         let names = &mut *self.names;
         let mut give = |role: u32, agent: &str| {
@@ -175,7 +215,7 @@ impl Change<'_> {
 
     /// Whether the `reply-to` of the message counts: the sender is the initiator, or an agent that
     /// continues in its place.
-    pub(crate) fn names_designated(&self, conversation: &Conversation, moves: &[Move]) -> bool {
+    fn names_designated(&self, conversation: &Conversation, moves: &[Move]) -> bool {
         let sender = self.observed.sender;
         self.names.is(conversation.initiator, sender)
             || conversation.is_designated(self.names, sender)
@@ -183,8 +223,8 @@ impl Change<'_> {
     }
 
     /// Adds the agents of the `reply-to`: they receive replies instead of the initiator.
-    pub(crate) fn designate(&mut self, conversation: &mut Conversation, header: &Header<'_>) {
-        for name in header.reply_to_names() {
+    fn designate(&mut self, conversation: &mut Conversation) {
+        for name in self.observed.reply_to {
             let known = conversation.reply_to().iter();
             let mut known = known.copied().chain(conversation.initiator);
             if !known.any(|agent| self.names.is(agent, name)) {
@@ -196,19 +236,15 @@ impl Change<'_> {
 
     /// Adds the agents of the `reply-to` of a participant: they receive messages instead of it
     /// (FIPA00061), and may continue in its place.
-    pub(crate) fn delegate(
-        &mut self,
-        conversation: &mut Conversation,
-        moves: &[Move],
-        header: &Header<'_>,
-    ) {
+    fn delegate(&mut self, conversation: &mut Conversation, moves: &[Move]) {
         if self.machine.scope == Scope::Conversation {
             let sender = self.observed.sender;
             let bound = conversation.bound.iter();
             let held = bound.filter(|bound| self.names.is(bound.agent, sender));
             let held: Vec<u8> = held.map(|bound| bound.role).collect();
-            for (name, role) in header
-                .reply_to_names()
+            for (name, role) in self
+                .observed
+                .reply_to
                 .iter()
                 .flat_map(|name| held.iter().map(move |role| (name, *role)))
             {
@@ -229,7 +265,7 @@ impl Change<'_> {
             return;
         }
         let index = PartyIndex::new(at);
-        for name in header.reply_to_names() {
+        for name in self.observed.reply_to {
             let known = self.names.is(conversation.initiator, name)
                 || conversation.party(self.names, name).is_some();
             if !known {

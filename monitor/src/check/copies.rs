@@ -2,6 +2,7 @@
 
 use std::hash::BuildHasher;
 
+use crate::MonitorLimits;
 use crate::check::observed::ObservedMessage;
 use crate::conversation::Conversation;
 use crate::conversation::bindings::RoleBinding;
@@ -10,33 +11,35 @@ use crate::conversation::rare::Copied;
 use crate::conversation::table::Slot;
 use crate::monitor::Monitor;
 use crate::verdict::ViolationKind as Kind;
-use crate::{Header, MonitorLimits};
+
+/// Fingerprints of a message to several receivers, and of the receiver of this copy.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct CopyKey {
+    pub(crate) message: u64,
+    pub(crate) receiver: u64,
+}
 
 impl Monitor {
     /// Returns fingerprints of a message and of its receiver, if this is the copy for one of several
     /// receivers.
-    pub(crate) fn copied(
-        &self,
-        header: &Header<'_>,
-        observed: &ObservedMessage<'_>,
-    ) -> Option<(u64, u64)> {
-        let addressed = header.addressed();
+    pub(crate) fn copied(&self, observed: &ObservedMessage<'_>) -> Option<CopyKey> {
+        let addressed = observed.addressed;
         let first = addressed.first()?;
         let receiver = observed.receivers.first()?;
         if addressed.len() == 1 && first == receiver {
             return None;
         }
         let message = (
-            header.act().name(),
+            observed.act.name(),
             observed.sender,
             addressed,
             observed.reply_with,
             observed.in_reply_to,
         );
-        Some((
-            self.hasher.hash_one(message),
-            self.hasher.hash_one(&**receiver),
-        ))
+        Some(CopyKey {
+            message: self.hasher.hash_one(message),
+            receiver: self.hasher.hash_one(&**receiver),
+        })
     }
 }
 
@@ -46,12 +49,12 @@ pub(crate) fn take_copy(
     conversation: &mut Conversation,
     names: &mut Names,
     observed: &ObservedMessage<'_>,
-    (fingerprint, receiver): (u64, u64),
+    copy: CopyKey,
     limits: &MonitorLimits,
 ) -> Option<Result<(), Kind>> {
     let mut all = conversation.rare.as_deref()?.copied.iter().enumerate();
-    let (place, copied) = all.find(|(_, copied)| copied.fingerprint == fingerprint)?;
-    if copied.seen.contains(&receiver) {
+    let (place, copied) = all.find(|(_, copied)| copied.fingerprint == copy.message)?;
+    if copied.seen.contains(&copy.receiver) {
         return None;
     }
     let name = observed.receivers.first()?;
@@ -65,7 +68,7 @@ pub(crate) fn take_copy(
         return Some(Err(Kind::TooMany));
     }
     let copied = conversation.rare().copied.get_mut(place)?;
-    copied.seen.push(receiver);
+    copied.seen.push(copy.receiver);
     let (_, to) = copied.roles;
     if to.count_ones() == 1 {
         let role = u8::try_from(to.trailing_zeros()).unwrap_or(0);
@@ -76,20 +79,15 @@ pub(crate) fn take_copy(
 }
 
 /// Keeps a message of which further copies may follow.
-pub(crate) fn keep_copied(
-    conversation: &mut Conversation,
-    fingerprint: u64,
-    receiver: u64,
-    roles: (u32, u32),
-) {
+pub(crate) fn keep_copied(conversation: &mut Conversation, copy: CopyKey, roles: (u32, u32)) {
     let copied = &mut conversation.rare().copied;
-    copied.retain(|copied| copied.fingerprint != fingerprint);
+    copied.retain(|copied| copied.fingerprint != copy.message);
     if copied.len() == Copied::MAX {
         copied.remove(0);
     }
     copied.push(Copied {
-        fingerprint,
-        seen: vec![receiver],
+        fingerprint: copy.message,
+        seen: vec![copy.receiver],
         roles,
     });
 }

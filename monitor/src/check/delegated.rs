@@ -15,6 +15,7 @@
 
 use std::sync::Arc;
 
+use crate::Moment;
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::Denied;
 use crate::conversation::ids::SlotIndex;
@@ -25,7 +26,6 @@ use crate::monitor::Monitor;
 use crate::protocol::act::{Act, FAILURE, INFORM};
 use crate::protocol::machine::{Cancel, Machine, Scope, step};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
-use crate::{Header, Moment};
 
 impl Monitor {
     /// Whether the conversation began between other agents.
@@ -52,7 +52,7 @@ impl Monitor {
         id: &str,
         parent: Option<SlotIndex>,
         machine: u16,
-        (header, observed): (&Header<'_>, &ObservedMessage<'_>),
+        observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<(), Denied> {
         let library = Arc::clone(&self.library);
@@ -60,7 +60,7 @@ impl Monitor {
         let Some(protocol) = protocol.filter(|it| it.shows_initiator(observed.act)) else {
             return Ok(());
         };
-        let at = self.insert(id, parent, machine, (header, observed), now)?;
+        let at = self.insert(id, parent, machine, observed, now)?;
         let agent = self.agent.as_deref().unwrap_or_default();
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;

@@ -9,7 +9,7 @@ use crate::conversation::party::Party;
 use crate::monitor::Monitor;
 use crate::protocol::machine::{Machine, Scope};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
-use crate::{Header, Library, Moment};
+use crate::{Library, Moment};
 
 impl Monitor {
     /// Checks a message with another protocol than its conversation has. It belongs to an embedded
@@ -18,11 +18,10 @@ impl Monitor {
         &mut self,
         library: &Library,
         main: SlotIndex,
-        header: &Header<'_>,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<Passed, Denied> {
-        let name = header.protocol_name().unwrap_or_default();
+        let name = observed.protocol.unwrap_or_default();
         let (mut denied, mut open) = (None, None);
         let mut children = 0;
         let mut may_begin = self.may_begin(library, main, name, observed.sender);
@@ -32,7 +31,7 @@ impl Monitor {
             may_begin |= self.may_begin(library, child, name, observed.sender);
             let called = self.machine_of(library, child);
             if called.is_some_and(|machine| machine.is_called(name)) {
-                match self.advance(child, header, observed, now) {
+                match self.advance(child, observed, now) {
                     Ok(passed) => {
                         self.touch(main, now.millis());
                         return Ok(passed);
@@ -50,8 +49,8 @@ impl Monitor {
                 (None, None) if self.began_elsewhere(library, main, name, observed.sender) => {
                     let inner = library.index_of(name).filter(|_| !observed.own);
                     if let Some(inner) = inner.filter(|_| children < self.limits.embedded) {
-                        let id = header.conversation().unwrap_or_default();
-                        let _ = self.join(id, Some(main), inner, (header, observed), now);
+                        let id = observed.conversation_id;
+                        let _ = self.join(id, Some(main), inner, observed, now);
                     }
                     Denied::Unchecked(Unchecked::BegunElsewhere)
                 }
@@ -67,8 +66,8 @@ impl Monitor {
         if children >= self.limits.embedded {
             return Err(Denied::Fault(Fault::plain(Kind::TooMany), main));
         }
-        let id = header.conversation().unwrap_or_default();
-        match self.open(id, Some(main), machine, header, observed, now) {
+        let id = observed.conversation_id;
+        match self.open(id, Some(main), machine, observed, now) {
             Ok(passed) => {
                 self.touch(main, now.millis());
                 Ok(passed)

@@ -2,7 +2,6 @@
 
 use smallvec::SmallVec;
 
-use crate::Header;
 use crate::check::observed::ObservedMessage;
 use crate::conversation::Conversation;
 use crate::conversation::ids::SlotIndex;
@@ -29,13 +28,12 @@ impl Monitor {
     pub(crate) fn place(
         &self,
         id: &str,
-        header: &Header<'_>,
         observed: &ObservedMessage<'_>,
     ) -> Option<(SlotIndex, &Slot)> {
         // One search: hashing the identifier is a large part of a check.
         let mut found = self.table.find_all(id);
         let first = found.next()?;
-        let fits_role = |slot: &Slot| self.fits_role(&slot.conversation, header, observed);
+        let fits_role = |slot: &Slot| self.fits_role(&slot.conversation, observed);
         // A service stands for the agent that did not get a message.
         let sender = observed.undelivered_to.unwrap_or(observed.sender);
         let Some(second) = found.next() else {
@@ -44,12 +42,12 @@ impl Monitor {
             if fits_role(slot) || self.rank(slot, sender, observed) == Rank::Both {
                 return Some(first);
             }
-            return self.place_among(id, &[first], header, observed);
+            return self.place_among(id, &[first], observed);
         };
         let alike = [first, second].into_iter().chain(found);
         let alike: SmallVec<[(SlotIndex, &Slot); MAX_ALIKE]> = alike.collect();
         let local = alike.iter().find(|(_, slot)| fits_role(slot)).copied();
-        local.or_else(|| self.place_among(id, &alike, header, observed))
+        local.or_else(|| self.place_among(id, &alike, observed))
     }
 
     /// Finds the conversation of a message among those with its identifier, when the roles of the agents do not
@@ -59,7 +57,6 @@ impl Monitor {
         &self,
         id: &str,
         alike: &[(SlotIndex, &'s Slot)],
-        header: &Header<'_>,
         observed: &ObservedMessage<'_>,
     ) -> Option<(SlotIndex, &'s Slot)> {
         let sender = observed.undelivered_to.unwrap_or(observed.sender);
@@ -68,7 +65,7 @@ impl Monitor {
             let rank = self.rank(slot, sender, observed);
             // Other agents may take part in a conversation that began elsewhere.
             let joined = rank == Rank::None && slot.conversation.joined;
-            let has_protocol = self.has_protocol(*at, header, observed);
+            let has_protocol = self.has_protocol(*at, observed);
             (rank, joined, has_protocol, self.table.serial(*at), *at)
         })?;
         if self.single || self.rank(slot, sender, observed) == Rank::Both {
@@ -81,7 +78,7 @@ impl Monitor {
             step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX).is_some()
                 || self.begins_for_role(machine, observed)
         };
-        let named = header.protocol_name();
+        let named = observed.protocol;
         let machine = named.and_then(|name| self.library.find(name));
         let stays = match machine {
             Some(machine) if begins(machine) => !self.begins_another(at, machine, observed),
@@ -163,13 +160,8 @@ impl Monitor {
 
     /// Whether the protocol of a message is that of the conversation or of one within it, or may begin
     /// within it.
-    fn has_protocol(
-        &self,
-        at: SlotIndex,
-        header: &Header<'_>,
-        observed: &ObservedMessage<'_>,
-    ) -> bool {
-        let Some(name) = header.protocol_name() else {
+    fn has_protocol(&self, at: SlotIndex, observed: &ObservedMessage<'_>) -> bool {
+        let Some(name) = observed.protocol else {
             return true;
         };
         let mut next = Some(at);

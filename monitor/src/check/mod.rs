@@ -22,19 +22,18 @@ use std::sync::Arc;
 
 use smallvec::SmallVec;
 
-use crate::check::alternatives::{PartiesBefore, keep_alternatives};
 use crate::check::apply::{Change, expire};
-use crate::check::bound::{NewBindings, growth_by, is_crowded};
-use crate::check::copies::{keep_copied, take_copy};
+use crate::check::bound::Additions;
+use crate::check::copies::take_copy;
 use crate::check::find::MAX_LOOKED_AT;
-use crate::check::judge::{Move, judge};
+use crate::check::judge::judge;
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::{Denied, Fault, Passed};
 use crate::check::report::violation;
 use crate::conversation::deadlines::Deadline;
 use crate::conversation::ids::{PartyIndex, SlotIndex};
 use crate::conversation::state::{is_final, is_over, state_name};
-use crate::conversation::table::{List, Slot};
+use crate::conversation::table::List;
 use crate::limits::{MAX_DESIGNATED, MAX_TEXT};
 use crate::monitor::Monitor;
 use crate::protocol::act::NOT_UNDERSTOOD;
@@ -140,16 +139,22 @@ impl Monitor {
         }
         let observed = ObservedMessage {
             act: header.act(),
+            conversation_id: id,
+            protocol: header.protocol_name(),
             sender,
             receivers,
             reply_with: self.fingerprints.of(header.reply_with_text()),
             reply_with_text: header.reply_with_text().unwrap_or_default(),
             in_reply_to: self.fingerprints.of(header.in_reply_to_text()),
+            reply_to: header.reply_to_names(),
+            reply_by: header.reply_by_time(now.wall),
+            addressed: header.addressed(),
+            peer: header.peer_name(),
             own,
             undelivered_to: header.undelivered_name(),
             own_receiver,
         };
-        let Some((main, slot)) = self.place(id, header, &observed) else {
+        let Some((main, slot)) = self.place(id, &observed) else {
             if observed.undelivered_to.is_some() {
                 return unchecked(Unchecked::UnknownHistory);
             }
@@ -159,7 +164,7 @@ impl Monitor {
             let Some(machine) = self.library.index_of(protocol) else {
                 return Err(self.unknown_protocol(protocol));
             };
-            return self.open(id, None, machine, header, &observed, now);
+            return self.open(id, None, machine, &observed, now);
         };
         let machine = self.library.machine(slot.conversation.machine);
         let follows = |name| {
@@ -173,11 +178,11 @@ impl Monitor {
                 let passed = self.advance_local(main, &projection, &observed, now);
                 return passed.map_err(|denied| self.recheck_local(id, main, denied));
             }
-            let passed = self.advance(main, header, &observed, now);
+            let passed = self.advance(main, &observed, now);
             return passed.map_err(|denied| self.recheck(main, &observed, denied, now));
         }
         let library = Arc::clone(&self.library);
-        self.embedded(&library, main, header, &observed, now)
+        self.embedded(&library, main, &observed, now)
     }
 
     fn is_too_large(&self, header: &Header<'_>, id: &str, sender: &str) -> bool {
@@ -218,16 +223,14 @@ impl Monitor {
     }
 
     /// Checks a message in an existing conversation and updates the conversation.
-    fn advance(
+    pub(crate) fn advance(
         &mut self,
         at: SlotIndex,
-        header: &Header<'_>,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<Passed, Denied> {
-        let now_ms = now.millis();
         let fault = |kind| Denied::Fault(Fault::plain(kind), at);
-        let copied = self.copied(header, observed);
+        let copy = self.copied(observed);
         let Some(slot) = self.table.slot_mut(at) else {
             return Err(fault(Kind::NotOpened));
         };
@@ -235,108 +238,71 @@ impl Monitor {
         let Some(machine) = self.library.machine(index) else {
             return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
         };
-        expire(machine, &mut slot.conversation, now_ms);
-        let copied = copied.filter(|_| machine.scope == Scope::Conversation);
-        if let Some((fingerprint, receiver)) = copied {
-            let names = &mut self.names;
-            let copy = (fingerprint, receiver);
-            match take_copy(&mut slot.conversation, names, observed, copy, &self.limits) {
-                Some(Ok(())) => {
-                    let passed = Passed::in_state_of(&slot.conversation, machine, index);
-                    self.charge(at);
-                    return Ok(passed);
-                }
-                Some(Err(kind)) => return Err(fault(kind)),
-                None => {}
-            }
+        expire(machine, &mut slot.conversation, now.millis());
+        let copy = copy.filter(|_| machine.scope == Scope::Conversation);
+        if let Some(copy) = copy
+            && let Some(further) = take_copy(
+                &mut slot.conversation,
+                &mut self.names,
+                observed,
+                copy,
+                &self.limits,
+            )
+        {
+            further.map_err(fault)?;
+            let passed = Passed::in_state_of(&slot.conversation, machine, index);
+            self.charge(at);
+            return Ok(passed);
         }
-        let conversation = &slot.conversation;
-        judge(
+        let (conversation, moves) = (&slot.conversation, &mut self.moves);
+        judge(machine, conversation, &self.names, observed, moves)
+            .map_err(|fault| Denied::Fault(fault, at))?;
+        let additions = Additions {
             machine,
             conversation,
-            &self.names,
+            names: &self.names,
             observed,
-            &mut self.moves,
-        )
-        .map_err(|fault| Denied::Fault(fault, at))?;
-        let is_new = |made: &&Move| made.target.is_new();
-        let added = self.moves.iter().filter(is_new).count();
-        let grown = conversation.parties.len() + added;
-        let moves = self.moves.as_slice();
-        let bindings = NewBindings::by(machine, conversation, &self.names, observed, moves, header);
-        let adds =
-            added > 0 || !header.reply_to_names().is_empty() || observed.undelivered_to.is_some();
-        let growth = if adds || machine.scope == Scope::Conversation {
-            let moves = (moves, &bindings, copied.is_some());
-            growth_by(machine, conversation, observed, moves, header)
-        } else {
-            0
+            moves,
+            is_copied: copy.is_some(),
         };
-        let size = || Slot::COST + conversation.allocated() + growth;
-        if grown > self.limits.participants
-            || conversation.bound.len() + bindings.count() > self.limits.participants + 1
-            || is_crowded(conversation, &self.names, header)
-            || growth > 0 && size() > self.limits.share_of_bytes()
-        {
+        if !additions.fit(&self.limits) {
             return Err(fault(Kind::TooMany));
         }
-        let due = header.reply_by_time(now.wall);
-        let due = due.map_or(0, |due| now.millis_at(due));
-        let roles = self.moves.first().map(|made| made.next_state.roles);
-        let mut change = Change {
+        let deadline = Deadline {
+            due: 0,
+            at,
+            generation: slot.generation,
+            party: PartyIndex::new(0),
+        };
+        let change = Change {
             machine,
             names: &mut self.names,
             deadlines: &mut self.deadlines,
             observed,
-            deadline: Deadline {
-                due: 0,
-                at,
-                generation: slot.generation,
-                party: PartyIndex::new(0),
-            },
-            now: now_ms,
-            due,
+            deadline,
+            now: now.millis(),
+            due: observed.reply_by.map_or(0, |due| now.millis_at(due)),
             opened: false,
             late: false,
             void: false,
             state: None,
         };
-        let before = PartiesBefore::of(&slot.conversation, machine);
-        for made in &self.moves {
-            if machine.scope == Scope::Conversation {
-                change.bind(&mut slot.conversation, made.next_state.roles);
-            }
-            change.make(&mut slot.conversation, made);
-        }
-        if !header.reply_to_names().is_empty() {
-            if change.names_designated(&slot.conversation, &self.moves) {
-                change.designate(&mut slot.conversation, header);
-            } else {
-                change.delegate(&mut slot.conversation, &self.moves, header);
-            }
-        }
-        let (opened, moved) = (change.opened, change.state);
-        let (late, void) = (change.late, change.void);
-        if let Some(((fingerprint, receiver), roles)) = copied.zip(roles) {
-            keep_copied(&mut slot.conversation, fingerprint, receiver, roles);
-        }
-        if let Some(before) = before {
-            let moves = (self.moves.as_slice(), before);
-            keep_alternatives(machine, &mut slot.conversation, observed, moves);
-        }
-        let passed = Passed::in_state_of(&slot.conversation, machine, index);
-        let passed = Passed {
-            state: moved.unwrap_or(passed.state),
-            opened,
-            late,
-            void,
-            ..passed
+        let passed = change.apply(&mut slot.conversation, &self.moves, copy);
+        self.settle(at, &passed, now.millis());
+        Ok(passed)
+    }
+
+    /// Updates the time, the place and the charge of a conversation after an accepted message.
+    #[inline]
+    fn settle(&mut self, at: SlotIndex, passed: &Passed, now: u64) {
+        let Some(slot) = self.table.slot_mut(at) else {
+            return;
         };
         let is_charged = slot.is_charged();
         // An embedded conversation is in no list, and one that is not complete is not over.
         let is_main = slot.parent.is_none();
-        if is_main && (passed.complete || !slot.touch(List::Open, now_ms)) {
-            self.touch(at, now_ms);
+        if is_main && (passed.complete || !slot.touch(List::Open, now)) {
+            self.touch(at, now);
         }
         if !is_charged {
             self.charge(at);
@@ -344,6 +310,5 @@ impl Monitor {
         if self.deadlines.are_many() {
             self.remove_stale_deadlines();
         }
-        Ok(passed)
     }
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use crate::Moment;
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::{Denied, Passed};
 use crate::conversation::ids::SlotIndex;
@@ -10,7 +11,6 @@ use crate::conversation::party::Party;
 use crate::monitor::Monitor;
 use crate::protocol::machine::{Machine, Scope, step};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
-use crate::{Header, Moment};
 
 impl Monitor {
     pub(crate) fn open(
@@ -18,7 +18,6 @@ impl Monitor {
         id: &str,
         parent: Option<SlotIndex>,
         machine: u16,
-        header: &Header<'_>,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<Passed, Denied> {
@@ -31,16 +30,16 @@ impl Monitor {
             && let Some(projection) = protocol.projection.clone().filter(|_| self.agent.is_some())
         {
             let machine = (machine, protocol);
-            return self.open_local(id, machine, &projection, (header, observed), now);
+            return self.open_local(id, machine, &projection, observed, now);
         }
         let begins = step(&protocol.initial().steps, observed.act, u32::MAX, u32::MAX);
         let Some(begins) = begins else {
             return Err(match parent {
-                None => self.unopened(id, machine, protocol, header, observed, now),
+                None => self.unopened(id, machine, protocol, observed, now),
                 Some(_) => Denied::NotOpened(machine),
             });
         };
-        let at = self.insert(id, parent, machine, (header, observed), now)?;
+        let at = self.insert(id, parent, machine, observed, now)?;
         let may_continue = parent.is_none() && !self.is_certain(id);
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;
@@ -53,7 +52,7 @@ impl Monitor {
                 conversation.rare().may_continue = true;
             }
         }
-        let passed = self.advance(at, header, observed, now);
+        let passed = self.advance(at, observed, now);
         passed.map_err(|denied| {
             self.remove(at);
             match denied {
@@ -72,7 +71,7 @@ impl Monitor {
         id: &str,
         parent: Option<SlotIndex>,
         machine: u16,
-        (header, observed): (&Header<'_>, &ObservedMessage<'_>),
+        observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<SlotIndex, Denied> {
         if parent.is_none() {
@@ -85,7 +84,7 @@ impl Monitor {
             }
             None if observed.own => None,
             None => {
-                let peer = header.peer_name().unwrap_or(observed.sender);
+                let peer = observed.peer.unwrap_or(observed.sender);
                 Some(self.names.acquire(peer))
             }
         };
@@ -105,7 +104,6 @@ impl Monitor {
         id: &str,
         machine: u16,
         protocol: &Machine,
-        header: &Header<'_>,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Denied {
@@ -124,7 +122,7 @@ impl Monitor {
         }
         // The sender may have named the monitored agent in a `reply-to`, or the agent has restarted.
         if protocol.shows_initiator(observed.act) {
-            if let Err(denied) = self.join(id, None, machine, (header, observed), now) {
+            if let Err(denied) = self.join(id, None, machine, observed, now) {
                 return denied;
             }
             return Denied::Unchecked(Unchecked::BegunElsewhere);

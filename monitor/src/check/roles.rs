@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use crate::Moment;
 use crate::check::judge::unbound;
 use crate::check::observed::ObservedMessage;
 use crate::check::outcome::{Denied, Fault, Passed};
@@ -18,7 +19,6 @@ use crate::protocol::act::{CANCEL, FAILURE, NOT_UNDERSTOOD};
 use crate::protocol::machine::Machine;
 use crate::protocol::projection::{LocalRun, NotLocal, Observed, Projection};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
-use crate::{Header, Moment};
 
 impl Monitor {
     /// Begins a conversation with the first message that the agent sends or receives in it.
@@ -27,7 +27,7 @@ impl Monitor {
         id: &str,
         (index, machine): (u16, &Machine),
         projection: &Projection,
-        (header, observed): (&Header<'_>, &ObservedMessage<'_>),
+        observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<Passed, Denied> {
         if begun(projection, observed).is_none() {
@@ -40,7 +40,7 @@ impl Monitor {
             });
         }
         let is_certain = self.is_certain(id);
-        let at = self.insert(id, None, index, (header, observed), now)?;
+        let at = self.insert(id, None, index, observed, now)?;
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;
             conversation.initiator = Some(conversation.acquire(&mut self.names, observed.sender));
@@ -94,22 +94,16 @@ impl Monitor {
     pub(crate) fn fits_role(
         &self,
         conversation: &Conversation,
-        header: &Header<'_>,
         observed: &ObservedMessage<'_>,
     ) -> bool {
         conversation.is_local()
             && observed.undelivered_to.is_none()
-            && self.fits_local(conversation, header, observed)
+            && self.fits_local(conversation, observed)
     }
 
-    fn fits_local(
-        &self,
-        conversation: &Conversation,
-        header: &Header<'_>,
-        observed: &ObservedMessage<'_>,
-    ) -> bool {
+    fn fits_local(&self, conversation: &Conversation, observed: &ObservedMessage<'_>) -> bool {
         let machine = self.library.machine(conversation.machine);
-        let named = header.protocol_name();
+        let named = observed.protocol;
         let called = |machine: &&Machine| named.is_none_or(|name| machine.is_called(name));
         let Some(machine) = machine.filter(called) else {
             return false;
