@@ -95,26 +95,26 @@ pub(crate) fn keep_alternatives(
     };
     let index = |at: usize| Some(PartyIndex::new(at));
     let step_of = |party: Option<PartyIndex>| {
-        let mut steps = moves.iter().filter(|made| {
-            let NextState { void, state, .. } = made.next_state;
-            !void && !made.reported && state != FAILED
+        let mut steps = moves.iter().filter(|party_move| {
+            let NextState { void, state, .. } = party_move.next_state;
+            !void && !party_move.reported && state != FAILED
         });
-        steps.find(|made| match made.target {
+        steps.find(|party_move| match party_move.target {
             MoveTarget::Party(at) => index(at) == party,
             MoveTarget::Unnamed => party.is_none(),
             MoveTarget::Receiver(_) | MoveTarget::Sender => false,
         })
     };
     // A cancel and its answers fit any state, but a message may also be a step of the protocol.
-    let fits_any_state = |made: &Move| {
-        let NextState { state, crossed, .. } = made.next_state;
-        made.next_state.answers_cancel || [CANCELLING, CANCELLED].contains(&state) && !crossed
+    let fits_any_state = |party_move: &Move| {
+        let NextState { state, crossed, .. } = party_move.next_state;
+        party_move.next_state.answers_cancel || [CANCELLING, CANCELLED].contains(&state) && !crossed
     };
     let alternatives = std::mem::take(&mut rare.alternatives);
-    let kept = alternatives.into_iter().flat_map(|(party, state)| {
-        let made = step_of(party).filter(|_| state != FAILED);
-        let stays = made.is_none_or(fits_any_state);
-        let step = made.and_then(|_| {
+    let remaining = alternatives.into_iter().flat_map(|(party, state)| {
+        let party_move = step_of(party).filter(|_| state != FAILED);
+        let stays = party_move.is_none_or(fits_any_state);
+        let step = party_move.and_then(|_| {
             let state = machine.state(state)?;
             step(&state.steps, observed.act, u32::MAX, u32::MAX)
         });
@@ -123,12 +123,12 @@ pub(crate) fn keep_alternatives(
             .into_iter()
             .chain(step.map(|step| (party, step.target)))
     });
-    let reported = moves.iter().filter(|made| made.reported);
-    let reported = reported.filter_map(|made| match made.target {
+    let reported = moves.iter().filter(|party_move| party_move.reported);
+    let reported = reported.filter_map(|party_move| match party_move.target {
         MoveTarget::Party(at) => Some(any_state_of(at)),
         MoveTarget::Unnamed | MoveTarget::Receiver(_) | MoveTarget::Sender => None,
     });
-    rare.alternatives = kept.chain(reported).collect();
+    rare.alternatives = remaining.chain(reported).collect();
     rare.alternatives.sort_unstable();
     rare.alternatives.dedup();
     let first = &machine.initial().steps;

@@ -63,7 +63,7 @@ impl Change<'_> {
             if self.machine.scope == Scope::Conversation {
                 self.bind(conversation, party_move.next_state.roles);
             }
-            self.make(conversation, party_move);
+            self.make_move(conversation, party_move);
         }
         if !self.observed.reply_to.is_empty() {
             if self.names_designated(conversation, moves) {
@@ -88,9 +88,9 @@ impl Change<'_> {
         }
     }
 
-    fn make(&mut self, conversation: &mut Conversation, made: &Move) {
+    fn make_move(&mut self, conversation: &mut Conversation, party_move: &Move) {
         let fresh = |peer| Party::new(peer, self.machine.initial);
-        let index = match made.target {
+        let index = match party_move.target {
             MoveTarget::Party(index) => index,
             MoveTarget::Receiver(number) => {
                 let receiver = self.observed.receivers.get(number);
@@ -113,15 +113,15 @@ impl Change<'_> {
                     Some(party) => party,
                     None => Box::new(fresh(None)),
                 };
-                self.move_party(&mut party, made);
+                self.move_party(&mut party, party_move);
                 conversation.rare().unnamed = Some(party);
                 return;
             }
         };
-        self.opened |= made.target.is_new();
+        self.opened |= party_move.target.is_new();
         if let Some(party) = conversation.parties.get_mut(index) {
-            self.opened |= party.acts == [0; 2] && !made.reported;
-            self.move_party(party, made);
+            self.opened |= party.acts == [0; 2] && !party_move.reported;
+            self.move_party(party, party_move);
             if party.deadline != 0 {
                 self.deadlines.push(Deadline {
                     due: party.deadline,
@@ -132,15 +132,15 @@ impl Change<'_> {
         }
     }
 
-    fn move_party(&mut self, party: &mut Party, made: &Move) {
+    fn move_party(&mut self, party: &mut Party, party_move: &Move) {
         let Move {
             side, next_state, ..
-        } = made;
+        } = party_move;
         let side = *side;
         if let Some(world) = next_state.world {
             party.settle(world);
         }
-        let answers = party.last != side && !made.reported;
+        let answers = party.last != side && !party_move.reported;
         self.late |= party.deadline != 0 && party.deadline < self.now && answers;
         let cancels = next_state.state == CANCELLING && party.state != CANCELLING;
         if next_state.void {
@@ -150,11 +150,11 @@ impl Change<'_> {
             (self.late, self.void) = (true, true);
             return;
         }
-        if made.reported && party.state != FAILED && party.take_back_last(side) {
+        if party_move.reported && party.state != FAILED && party.take_back_last(side) {
             self.state = self.state.or(Some(party.state));
             return;
         }
-        if made.reported || next_state.state == FAILED {
+        if party_move.reported || next_state.state == FAILED {
             // The message that failed may be sent again, from the state before it.
             (party.state, party.resume, party.echo) =
                 (next_state.state, next_state.resume, next_state.echo);
@@ -219,7 +219,9 @@ impl Change<'_> {
         let sender = self.observed.sender;
         self.names.is(conversation.initiator, sender)
             || conversation.is_designated(self.names, sender)
-                && moves.iter().any(|made| made.side == Side::Initiator)
+                && moves
+                    .iter()
+                    .any(|party_move| party_move.side == Side::Initiator)
     }
 
     /// Adds the agents of the `reply-to`: they receive replies instead of the initiator.
@@ -260,7 +262,7 @@ impl Change<'_> {
         let Some(at) = sender.map(|(at, _)| at) else {
             return;
         };
-        let answers = |made: &Move| made.side == Side::Other;
+        let answers = |party_move: &Move| party_move.side == Side::Other;
         if !moves.iter().any(answers) {
             return;
         }

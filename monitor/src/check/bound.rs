@@ -77,8 +77,8 @@ impl Additions<'_> {
                     .iter()
                     .any(|(_, known)| names.is(*known, name))
         };
-        let kept = conversation.reply_to().len() + conversation.delegates().len();
-        kept + reply_to.iter().filter(new).count() > MAX_DESIGNATED
+        let known = conversation.reply_to().len() + conversation.delegates().len();
+        known + reply_to.iter().filter(new).count() > MAX_DESIGNATED
     }
 
     fn bindings(&self) -> NewBindings {

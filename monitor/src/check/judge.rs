@@ -150,7 +150,7 @@ impl Judge<'_> {
             let (side, next_state) = led.map_err(|kind| self.fault(kind, party, receiver))?;
             // Several patterns have one state, and so have a participant and its delegates.
             let shared = target == MoveTarget::Unnamed || !conversation.delegates().is_empty();
-            let again = shared && moves.iter().any(|made| made.target == target);
+            let again = shared && moves.iter().any(|party_move| party_move.target == target);
             if !again {
                 let reported = false;
                 moves.push(Move {
@@ -229,11 +229,11 @@ impl Judge<'_> {
             let (Some((at, party, side)), None) = (concerned.next(), concerned.next()) else {
                 continue;
             };
-            let made = failed(at, party, side);
+            let party_move = failed(at, party, side);
             // Several agents may speak for the initiator.
             let is_shared = lost_party.is_some_and(|(lost, _)| lost == at);
-            if !is_shared || !moves.iter().any(|other| other.target == made.target) {
-                moves.push(made);
+            if !is_shared || !moves.iter().any(|other| other.target == party_move.target) {
+                moves.push(party_move);
             }
         }
     }
@@ -374,7 +374,7 @@ impl Judge<'_> {
     fn guards(&self, moves: &[Move]) -> Result<(), Fault> {
         let Some(guarded) = moves
             .iter()
-            .find(|made| made.next_state.guard != Guard::default())
+            .find(|party_move| party_move.next_state.guard != Guard::default())
         else {
             return Ok(());
         };
@@ -391,8 +391,8 @@ impl Judge<'_> {
             ..
         } = guarded.next_state;
         let mut moved = vec![false; conversation.parties.len()];
-        for made in moves {
-            if let MoveTarget::Party(at) = made.target
+        for party_move in moves {
+            if let MoveTarget::Party(at) = party_move.target
                 && let Some(moved) = moved.get_mut(at)
             {
                 *moved = true;
@@ -405,7 +405,9 @@ impl Judge<'_> {
             Err(self.fault(Kind::Guard, party, peer))
         };
         if guard.at_most > 0 {
-            let reach = moves.iter().filter(|made| made.next_state.state == target);
+            let reach = moves
+                .iter()
+                .filter(|party_move| party_move.next_state.state == target);
             let there = others().filter(|(party, _)| party.state == target);
             if reach.count() + there.clone().count() > usize::from(guard.at_most) {
                 let mut blocking = there

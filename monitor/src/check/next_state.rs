@@ -321,10 +321,10 @@ fn in_state(
     state: u16,
     message: &PartyMessage<'_>,
 ) -> Result<NextState, Kind> {
-    let Some(here) = machine.state(state) else {
+    let Some(current) = machine.state(state) else {
         return Err(Kind::Unexpected);
     };
-    let Some(step) = step(&here.steps, message.act, message.from, message.to) else {
+    let Some(step) = step(&current.steps, message.act, message.from, message.to) else {
         return without_step(machine, party, state, message);
     };
     Ok(match in_reply(party, message)? {
@@ -343,7 +343,7 @@ fn without_step(
     state: u16,
     message: &PartyMessage<'_>,
 ) -> Result<NextState, Kind> {
-    let embedded = machine.state(state).map(|here| here.embedded.iter());
+    let embedded = machine.state(state).map(|current| current.embedded.iter());
     let proxied = embedded.into_iter().flatten().any(|sub| {
         let to = sub.proxied_to.as_ref();
         sub.from.includes(message.from) && to.is_some_and(|to| to.includes(message.to))
@@ -399,8 +399,8 @@ fn by_default(
     if party.is_fresh() || !message.known {
         return None;
     }
-    let here = machine.state(state)?;
-    let has_ended = here.is_final;
+    let current = machine.state(state)?;
+    let has_ended = current.is_final;
     // The receiver of the last message may not have understood it. Its sender cannot send
     // `not-understood`.
     let answers_last = party.last != message.side;
@@ -414,7 +414,7 @@ fn by_default(
                     && ended_by.is_some_and(|act| step.acts.contains(act))
             };
             let has_crossed = !message.own
-                && !here.is_over()
+                && !current.is_over()
                 && machine.states.iter().flat_map(|it| &it.steps).any(ends);
             let may = !has_ended || answers_last || has_crossed;
             may.then(|| NextState::not_understood_in(state))
@@ -427,7 +427,7 @@ fn by_default(
             };
             // After the end, a cancel is allowed only if its sender may not have received the last
             // message.
-            let too_late = here.is_over() && (message.own || !answers_last);
+            let too_late = current.is_over() && (message.own || !answers_last);
             (may && !too_late).then_some(NextState {
                 resume: state,
                 ..NextState::to(CANCELLING)
@@ -485,13 +485,13 @@ fn wrong(machine: &Machine, party: &Party, state: u16, message: &PartyMessage<'_
     if is_repeated(party, message) {
         return Kind::Repeated;
     }
-    let Some(here) = machine.state(state) else {
+    let Some(current) = machine.state(state) else {
         return Kind::Unexpected;
     };
-    if here.is_over() {
+    if current.is_over() {
         return Kind::Ended;
     }
-    if step(&here.steps, message.act, message.to, message.from).is_some() {
+    if step(&current.steps, message.act, message.to, message.from).is_some() {
         return Kind::WrongSender;
     }
     // Checks whether a later state allows the message.

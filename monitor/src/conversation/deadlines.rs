@@ -96,7 +96,7 @@ mod tests {
     #[test]
     fn stale_deadlines_are_removed_beyond_a_bound() {
         let mut deadlines = Deadlines::default();
-        let mut left = |more, counts| {
+        let mut remaining = |more, counts| {
             for due in 0..more {
                 deadlines.push(Deadline {
                     due,
@@ -110,10 +110,10 @@ mod tests {
             }
             deadlines.len()
         };
-        assert_eq!(left(1_024, false), 1_024);
-        assert_eq!(left(1, false), 0);
-        assert_eq!(left(3_000, true), 3_000);
-        assert_eq!(left(4_024, false), 7_024);
-        assert_eq!(left(1, false), 0);
+        assert_eq!(remaining(1_024, false), 1_024);
+        assert_eq!(remaining(1, false), 0);
+        assert_eq!(remaining(3_000, true), 3_000);
+        assert_eq!(remaining(4_024, false), 7_024);
+        assert_eq!(remaining(1, false), 0);
     }
 }

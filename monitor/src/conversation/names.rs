@@ -190,12 +190,12 @@ mod tests {
 
     #[test]
     fn buffers_of_long_names_are_not_kept() {
-        for (len, kept) in [(40, true), (64, true), (65, false), (1_000, false)] {
+        for (len, is_reused) in [(40, true), (64, true), (65, false), (1_000, false)] {
             let mut names = Names::new(RandomState::new());
             let name = names.acquire(&"x".repeat(len));
             names.release(name);
-            let left = names.entries[name.get()].name.capacity();
-            assert_eq!(left >= len, kept, "{len}: {left}");
+            let capacity = names.entries[name.get()].name.capacity();
+            assert_eq!(capacity >= len, is_reused, "{len}: {capacity}");
         }
     }
 }

@@ -349,17 +349,17 @@ impl Tail {
             from += 1;
         }
         let mut tail = Self::default();
-        let kept = text.as_bytes().get(from..).unwrap_or_default();
-        for (to, byte) in tail.bytes.iter_mut().zip(kept) {
+        let last_bytes = text.as_bytes().get(from..).unwrap_or_default();
+        for (to, byte) in tail.bytes.iter_mut().zip(last_bytes) {
             *to = *byte;
         }
-        tail.len = u8::try_from(kept.len()).unwrap_or(0);
+        tail.len = u8::try_from(last_bytes.len()).unwrap_or(0);
         tail
     }
 
     pub(crate) fn text(&self) -> &str {
-        let kept = self.bytes.get(..usize::from(self.len));
-        std::str::from_utf8(kept.unwrap_or_default()).unwrap_or_default()
+        let last_bytes = self.bytes.get(..usize::from(self.len));
+        std::str::from_utf8(last_bytes.unwrap_or_default()).unwrap_or_default()
     }
 }
 

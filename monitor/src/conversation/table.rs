@@ -702,12 +702,12 @@ mod tests {
 
     #[test]
     fn buffers_of_long_ids_are_not_kept() {
-        for (len, kept) in [(100, true), (128, true), (129, false), (1_000, false)] {
+        for (len, is_reused) in [(100, true), (128, true), (129, false), (1_000, false)] {
             let mut table = Table::new(&RandomState::new());
             let at = table.insert(&"x".repeat(len), None, peer(7), 0, 1);
             table.remove(at);
-            let left = table.cold[at.get()].id.capacity();
-            assert_eq!(left >= len, kept, "{len}: {left}");
+            let capacity = table.cold[at.get()].id.capacity();
+            assert_eq!(capacity >= len, is_reused, "{len}: {capacity}");
         }
     }
 

@@ -349,8 +349,11 @@ mod tests {
                 let before = COMPARISONS.get();
                 let verdict = monitor.check(&message, now);
                 assert!(verdict.is_accepted(), "{verdict:?}");
-                let made = COMPARISONS.get() - before;
-                assert!(made < 10 * MANY, "{protocol}: {made} comparisons");
+                let comparisons = COMPARISONS.get() - before;
+                assert!(
+                    comparisons < 10 * MANY,
+                    "{protocol}: {comparisons} comparisons"
+                );
             }
         }
     }

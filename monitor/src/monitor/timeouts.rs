@@ -25,7 +25,7 @@ impl Monitor {
     /// monotonic clock: see [`Moment::elapsed`].
     #[must_use]
     pub fn poll_elapsed(&self) -> Option<Duration> {
-        let kept = |list, span: Duration| {
+        let removal_at = |list, span: Duration| {
             let slot = self.table.slot(self.table.oldest(list)?)?;
             Some(
                 slot.touched
@@ -33,8 +33,8 @@ impl Monitor {
                     .saturating_add(1),
             )
         };
-        let ended = kept(List::Ended, self.limits.ended);
-        let idle = kept(List::Open, self.limits.idle);
+        let ended = removal_at(List::Ended, self.limits.ended);
+        let idle = removal_at(List::Open, self.limits.idle);
         let due = self.deadlines.next().map(|due| due.saturating_add(1));
         let next = [ended, idle, due].into_iter().flatten().min()?;
         Some(Duration::from_millis(next))

@@ -301,8 +301,8 @@ fn after(parts: &[Part], locals: &[Local], message: Observed<'_>) -> Vec<(Part, 
         return taken;
     }
     // An early message waits only if it fits no role now.
-    let kept = with_local().filter_map(|(part, local)| part.keeping(local, message));
-    kept.collect()
+    let waiting = with_local().filter_map(|(part, local)| part.keeping(local, message));
+    waiting.collect()
 }
 
 impl Part {

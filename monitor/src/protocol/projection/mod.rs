@@ -323,9 +323,9 @@ pub(crate) fn role_name(machine: &Machine, role: u8) -> &str {
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 struct Unseen {
     /// The states that messages lead to.
-    told: BTreeSet<u16>,
+    by_messages: BTreeSet<u16>,
     /// The states that timeouts lead to.
-    timed: BTreeSet<u16>,
+    by_timeouts: BTreeSet<u16>,
 }
 
 impl Unseen {
@@ -342,25 +342,30 @@ impl Unseen {
                 }
             }
         };
-        let mut told = from;
-        hidden(&mut told);
-        let mut timed = BTreeSet::new();
+        let mut by_messages = from;
+        hidden(&mut by_messages);
+        let mut by_timeouts = BTreeSet::new();
         loop {
-            let known = told.len() + timed.len();
-            let all = told.union(&timed).filter_map(|state| machine.state(*state));
+            let known = by_messages.len() + by_timeouts.len();
+            let all = by_messages
+                .union(&by_timeouts)
+                .filter_map(|state| machine.state(*state));
             let targets = all.filter_map(|state| Some(state.timeout?.target));
             let targets: Vec<u16> = targets.collect();
-            timed.extend(targets);
-            hidden(&mut timed);
-            timed.retain(|state| !told.contains(state));
-            if told.len() + timed.len() == known {
-                return Self { told, timed };
+            by_timeouts.extend(targets);
+            hidden(&mut by_timeouts);
+            by_timeouts.retain(|state| !by_messages.contains(state));
+            if by_messages.len() + by_timeouts.len() == known {
+                return Self {
+                    by_messages,
+                    by_timeouts,
+                };
             }
         }
     }
 
     fn all(&self) -> impl Iterator<Item = u16> + Clone {
-        self.told.union(&self.timed).copied()
+        self.by_messages.union(&self.by_timeouts).copied()
     }
 }
 
@@ -421,13 +426,13 @@ fn not_told(machine: &Machine, steps: &Steps, role: u8, set: &Unseen, defects: &
         steps.clone().any(|(known, _)| known == label)
     };
     let mut known: Vec<&Label> = Vec::new();
-    for state in &set.told {
+    for state in &set.by_messages {
         for (label, _) in steps.get(usize::from(*state)).into_iter().flatten() {
             if label.from != role || known.contains(&label) {
                 continue;
             }
             known.push(label);
-            let silent = set.told.iter().find(|other| !sends(**other, label));
+            let silent = set.by_messages.iter().find(|other| !sends(**other, label));
             if let Some(other) = silent {
                 let id = |state| machine.state(state).map_or("", State::id).to_owned();
                 let defect = Defect::NotTold {

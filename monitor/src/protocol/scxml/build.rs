@@ -31,12 +31,12 @@ pub(super) fn machine(
         known_acts: HashMap::new(),
         known_roles: HashMap::new(),
     };
-    let made = builder.machine(file_name);
-    let made = match made {
+    let built = builder.machine(file_name);
+    let built = match built {
         Some(machine) if builder.mistakes.is_empty() => Ok(machine),
         _ => Err(builder.mistakes),
     };
-    (made, builder.warnings)
+    (built, builder.warnings)
 }
 
 struct Builder<'d> {

@@ -67,17 +67,17 @@ impl Machine {
     /// # Errors
     /// See [`read`](Self::read).
     pub fn read_with_warnings(file: &str, text: &str) -> Result<(Self, Vec<Warning>), ScxmlError> {
-        let (made, warnings) = match document::read(text) {
+        let (result, warnings) = match document::read(text) {
             Ok((document, mut warnings)) => {
-                let (made, near) = build::machine(&document, protocol_name(file));
+                let (result, near) = build::machine(&document, protocol_name(file));
                 warnings.extend(near);
                 warnings.sort_by_key(|warning| warning.line);
                 warnings.truncate(MAX_MISTAKES);
-                (made, warnings)
+                (result, warnings)
             }
             Err(mistake) => (Err(vec![mistake]), Vec::new()),
         };
-        match made {
+        match result {
             Ok(machine) => Ok((machine, warnings)),
             Err(mut mistakes) => {
                 mistakes.truncate(MAX_MISTAKES);
