@@ -36,6 +36,7 @@ use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::monitor::Monitor;
 use crate::protocol::act::Act;
 use crate::protocol::machine::{Machine, Scope};
+use crate::protocol::role::Role;
 use crate::{Library, Moment, MonitorLimits};
 
 const MAGIC: [u8; 8] = *b"fipa-cnv";
@@ -176,7 +177,7 @@ impl Monitor {
         }
         put_count(out, conversation.bound.len());
         for bound in conversation.bound.iter() {
-            out.push(bound.role);
+            out.push(bound.role.get());
             put_text(out, names.text(bound.agent))?;
         }
         put_count(out, conversation.reply_to().len());
@@ -362,7 +363,7 @@ struct Part<'s> {
     initiator: &'s str,
     parties: Vec<(&'s str, Party)>,
     unnamed: Option<Party>,
-    bound: Vec<(u8, &'s str)>,
+    bound: Vec<(Role, &'s str)>,
     reply_to: Vec<&'s str>,
     delegates: Vec<(PartyIndex, &'s str)>,
 }
@@ -520,7 +521,7 @@ impl<'s> Input<'s> {
         let count = self.count(participants + 1, "number of agents with roles")?;
         let mut bound = Vec::new();
         for _ in 0..count {
-            bound.push((self.u8()?, self.name()?));
+            bound.push((Role::new(self.u8()?), self.name()?));
         }
         let count = self.count(MAX_DESIGNATED, "number of agents in reply-to")?;
         let mut reply_to = Vec::new();
@@ -559,7 +560,7 @@ impl<'s> Input<'s> {
         if !fits {
             return malformed("participants that do not fit the protocol");
         }
-        let unknown = |role: u8| usize::from(role) >= machine.roles.len();
+        let unknown = |role: Role| role.index() >= machine.roles.len();
         if bound.iter().any(|(role, _)| unknown(*role)) {
             return malformed("an unknown role");
         }

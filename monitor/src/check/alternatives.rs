@@ -10,6 +10,7 @@ use crate::conversation::ids::{PartyIndex, SlotIndex};
 use crate::conversation::state::{CANCELLED, CANCELLING, FAILED};
 use crate::monitor::Monitor;
 use crate::protocol::machine::{Machine, Scope, step};
+use crate::protocol::role::RoleSet;
 use crate::verdict::Unchecked;
 
 impl Monitor {
@@ -116,7 +117,7 @@ pub(crate) fn keep_alternatives(
         let stays = party_move.is_none_or(fits_any_state);
         let step = party_move.and_then(|_| {
             let state = machine.state(state)?;
-            step(&state.steps, observed.act, u32::MAX, u32::MAX)
+            step(&state.steps, observed.act, RoleSet::ALL, RoleSet::ALL)
         });
         let stays = stays.then_some((party, state));
         stays
@@ -132,7 +133,7 @@ pub(crate) fn keep_alternatives(
     rare.alternatives.sort_unstable();
     rare.alternatives.dedup();
     let first = &machine.initial().steps;
-    let Some(first) = step(first, observed.act, u32::MAX, u32::MAX) else {
+    let Some(first) = step(first, observed.act, RoleSet::ALL, RoleSet::ALL) else {
         return;
     };
     let unnamed = (rare.unnamed.is_some() && !before.has_unnamed).then_some(None);

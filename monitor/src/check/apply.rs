@@ -14,6 +14,7 @@ use crate::conversation::names::Names;
 use crate::conversation::party::{Party, Side, act_number, side_index};
 use crate::conversation::state::{CANCELLING, FAILED};
 use crate::protocol::machine::{After, Machine, Scope};
+use crate::protocol::role::{MessageRoles, Role, RoleSet};
 
 /// Applies the timeouts that are due.
 pub(crate) fn expire(machine: &Machine, conversation: &mut Conversation, now: u64) {
@@ -197,19 +198,18 @@ impl Change<'_> {
     }
 
     /// Binds free roles of a step to the sender and the receivers.
-    fn bind(&mut self, conversation: &mut Conversation, (from, to): (u32, u32)) {
+    fn bind(&mut self, conversation: &mut Conversation, roles: MessageRoles) {
         let free = unbound(self.machine, conversation);
         let names = &mut *self.names;
-        let mut give = |role: u32, agent: &str| {
-            if role & free != 0 && role.count_ones() == 1 {
+        let mut give = |roles: RoleSet, agent: &str| {
+            if let Some(role) = roles.only().filter(|role| free.contains(*role)) {
                 let agent = conversation.acquire(names, agent);
-                let role = u8::try_from(role.trailing_zeros()).unwrap_or(0);
                 conversation.bound.push(RoleBinding { role, agent });
             }
         };
-        give(from, self.observed.sender);
+        give(roles.from, self.observed.sender);
         for receiver in self.observed.receivers {
-            give(to, receiver);
+            give(roles.to, receiver);
         }
     }
 
@@ -243,7 +243,7 @@ impl Change<'_> {
             let sender = self.observed.sender;
             let bound = conversation.bound.iter();
             let held = bound.filter(|bound| self.names.is(bound.agent, sender));
-            let held: Vec<u8> = held.map(|bound| bound.role).collect();
+            let held: Vec<Role> = held.map(|bound| bound.role).collect();
             for (name, role) in self
                 .observed
                 .reply_to

@@ -12,6 +12,7 @@ use crate::conversation::rare::Copied;
 use crate::conversation::table::Slot;
 use crate::limits::MAX_DESIGNATED;
 use crate::protocol::machine::{Machine, Scope};
+use crate::protocol::role::{MessageRoles, RoleSet};
 
 /// The parts that an accepted message adds to its conversation.
 pub(crate) struct Additions<'a> {
@@ -92,9 +93,9 @@ impl Additions<'_> {
             return NewBindings::default();
         };
         let free = unbound(machine, conversation);
-        let (from, to) = first.next_state.roles;
+        let MessageRoles { from, to } = first.next_state.roles;
         // A pattern of several roles binds none.
-        let binds = |roles: u32| roles & free != 0 && roles.count_ones() == 1;
+        let binds = |roles: RoleSet| roles.only().is_some_and(|role| free.contains(role));
         let sender = usize::from(binds(from));
         let reply_to = observed.reply_to.len();
         let leads = || conversation.speaks_for_initiator(names, observed.sender);

@@ -10,6 +10,7 @@ use crate::conversation::names::Names;
 use crate::conversation::rare::Copied;
 use crate::conversation::table::Slot;
 use crate::monitor::Monitor;
+use crate::protocol::role::MessageRoles;
 use crate::verdict::ViolationKind as Kind;
 
 /// Fingerprints of a message to several receivers, and of the receiver of this copy.
@@ -69,9 +70,7 @@ pub(crate) fn take_copy(
     }
     let copied = conversation.rare().copied.get_mut(place)?;
     copied.seen.push(copy.receiver);
-    let (_, to) = copied.roles;
-    if to.count_ones() == 1 {
-        let role = u8::try_from(to.trailing_zeros()).unwrap_or(0);
+    if let Some(role) = copied.roles.to.only() {
         let agent = conversation.acquire(names, name);
         conversation.bound.push(RoleBinding { role, agent });
     }
@@ -79,7 +78,7 @@ pub(crate) fn take_copy(
 }
 
 /// Keeps a message of which further copies may follow.
-pub(crate) fn keep_copied(conversation: &mut Conversation, copy: CopyKey, roles: (u32, u32)) {
+pub(crate) fn keep_copied(conversation: &mut Conversation, copy: CopyKey, roles: MessageRoles) {
     let copied = &mut conversation.rare().copied;
     copied.retain(|copied| copied.fingerprint != copy.message);
     if copied.len() == Copied::MAX {

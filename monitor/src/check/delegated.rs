@@ -25,6 +25,7 @@ use crate::conversation::state::ELSEWHERE;
 use crate::monitor::Monitor;
 use crate::protocol::act::{Act, FAILURE, INFORM};
 use crate::protocol::machine::{Cancel, Machine, Scope, step};
+use crate::protocol::role::RoleSet;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 
 impl Monitor {
@@ -111,7 +112,12 @@ impl Monitor {
             true
         } else {
             // Other agents may begin the protocol with the monitored agent too, or answer a cancel.
-            let begins = step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX);
+            let begins = step(
+                &machine.initial().steps,
+                observed.act,
+                RoleSet::ALL,
+                RoleSet::ALL,
+            );
             let cancels = machine.cancel != Cancel::Nobody;
             joined && (begins.is_some() || cancels && [INFORM, FAILURE].contains(&observed.act))
         };
@@ -174,7 +180,7 @@ impl Monitor {
 /// Returns the state to which this answer leads from any reachable state, or [`ELSEWHERE`] if there
 /// are several. Timeouts do not count: the `reply-by` of the question is unknown.
 fn after(machine: &Machine, act: Act<'_>) -> u16 {
-    let initiator = 1_u32 << machine.initiator;
+    let initiator = RoleSet::of(machine.initiator);
     let mut reached = vec![machine.initial];
     let (mut next, mut found) = (0, None);
     while let Some(state) = reached.get(next).and_then(|id| machine.state(*id)) {

@@ -8,6 +8,7 @@ use crate::conversation::names::Names;
 use crate::conversation::party::Party;
 use crate::monitor::Monitor;
 use crate::protocol::machine::{Machine, Scope};
+use crate::protocol::role::RoleSet;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 use crate::{Library, Moment};
 
@@ -112,7 +113,7 @@ impl Monitor {
         library: &Library,
         at: SlotIndex,
         protocol: &str,
-        by: impl Fn(&Holders<'_>) -> u32,
+        by: impl Fn(&Holders<'_>) -> RoleSet,
     ) -> bool {
         let Some((slot, machine)) = self.table.slot(at).zip(self.machine_of(library, at)) else {
             return false;
@@ -132,7 +133,7 @@ impl Monitor {
                     Some(inner) => sub.admits(inner),
                     None => sub.name.matches(protocol),
                 };
-                named && sub.from.mask & roles != 0
+                named && sub.from.mask.intersects(roles)
             })
         })
     }
@@ -147,16 +148,16 @@ pub(crate) struct Holders<'a> {
 }
 
 impl Holders<'_> {
-    pub(crate) fn of(&self, agent: &str) -> u32 {
-        let initiator = 1_u32 << self.machine.initiator;
+    pub(crate) fn of(&self, agent: &str) -> RoleSet {
+        let initiator = RoleSet::of(self.machine.initiator);
         match self.machine.scope {
             Scope::Participant if self.names.is(self.conversation.initiator, agent) => initiator,
             Scope::Participant if self.names.is(self.party.peer, agent) => !initiator,
-            Scope::Participant => 0,
+            Scope::Participant => RoleSet::NONE,
             Scope::Conversation => {
                 let bound = self.conversation.bound.iter();
                 let held = bound.filter(|bound| self.names.is(bound.agent, agent));
-                held.fold(0, |mask, bound| mask | (1 << bound.role))
+                held.map(|bound| bound.role).collect()
             }
         }
     }

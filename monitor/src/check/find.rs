@@ -10,6 +10,7 @@ use crate::limits::MAX_ALIKE;
 use crate::monitor::Monitor;
 use crate::protocol::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::protocol::machine::{Machine, Scope, step};
+use crate::protocol::role::RoleSet;
 
 /// The part that the agents of a message take in a conversation, the least first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -75,7 +76,13 @@ impl Monitor {
             return None;
         }
         let begins = |machine: &Machine| {
-            step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX).is_some()
+            step(
+                &machine.initial().steps,
+                observed.act,
+                RoleSet::ALL,
+                RoleSet::ALL,
+            )
+            .is_some()
                 || self.begins_for_role(machine, observed)
         };
         let named = observed.protocol;

@@ -15,6 +15,7 @@ use crate::conversation::party::{Party, Side, side_index};
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, ELSEWHERE, FAILED};
 use crate::protocol::act::{FAILURE, INFORM};
 use crate::protocol::machine::{Cancel, Guard, Machine, Scope, step};
+use crate::protocol::role::RoleSet;
 use crate::verdict::ViolationKind as Kind;
 
 /// The state transition of one party.
@@ -263,19 +264,19 @@ impl Judge<'_> {
         let unbound = unbound(self.machine, conversation);
         let known_roles = self.known_roles();
         let has = self.roles_of(sender);
-        let (mut to, mut all_bound, mut stranger) = (u32::MAX, has != 0, false);
+        let (mut to, mut all_bound, mut stranger) = (RoleSet::ALL, !has.is_empty(), false);
         for receiver in self.observed.receivers {
             let roles = match &known_roles {
                 None => self.roles_of(receiver),
                 Some(known) => {
                     let name = self.names.known(receiver);
                     let roles = name.and_then(|name| known.get(&name));
-                    roles.copied().unwrap_or(0)
+                    roles.copied().unwrap_or(RoleSet::NONE)
                 }
             };
             to &= roles | unbound;
-            all_bound &= roles != 0;
-            stranger |= roles | unbound == 0;
+            all_bound &= !roles.is_empty();
+            stranger |= (roles | unbound).is_empty();
         }
         let message = PartyMessage {
             from: has | unbound,
@@ -284,11 +285,11 @@ impl Judge<'_> {
             answers: conversation.bound.len() == 2,
             ..self.message(side)
         };
-        if let Some(lost) = self.observed.undelivered_to.filter(|_| has == 0) {
+        if let Some(lost) = self.observed.undelivered_to.filter(|_| has.is_empty()) {
             if stranger {
                 return Err(Fault::plain(Kind::Stranger));
             }
-            if self.roles_of(lost) != 0
+            if !self.roles_of(lost).is_empty()
                 && let Some(receiver) = self.observed.receivers.first()
             {
                 let leads = conversation.speaks_for_initiator(self.names, receiver);
@@ -297,7 +298,7 @@ impl Judge<'_> {
             }
             return Ok(());
         }
-        let outside = has == 0 && unbound == 0;
+        let outside = (has | unbound).is_empty();
         let next_state = match next_state(self.machine, party, &message) {
             Ok(next_state) => next_state,
             Err(kind) => {
@@ -324,18 +325,18 @@ impl Judge<'_> {
         Ok(())
     }
 
-    fn roles_of(&self, agent: &str) -> u32 {
+    fn roles_of(&self, agent: &str) -> RoleSet {
         let bound = self.conversation.bound.iter();
         let held = bound.filter(|bound| self.names.is(bound.agent, agent));
-        let roles = held.fold(0, |mask, bound| mask | (1 << bound.role));
+        let roles: RoleSet = held.map(|bound| bound.role).collect();
         if self.conversation.is_designated(self.names, agent) {
-            return roles | (1 << self.machine.initiator);
+            return roles | RoleSet::of(self.machine.initiator);
         }
         roles
     }
 
     fn message(&self, side: Side) -> PartyMessage<'_> {
-        let initiator = 1 << self.machine.initiator;
+        let initiator = RoleSet::of(self.machine.initiator);
         let (from, to) = match side {
             Side::Initiator => (initiator, !initiator),
             Side::Other => (!initiator, initiator),
@@ -355,17 +356,17 @@ impl Judge<'_> {
 
     /// The roles of all agents, if the message has so many receivers that a search for each takes
     /// longer.
-    fn known_roles(&self) -> Option<HashMap<Name, u32>> {
+    fn known_roles(&self) -> Option<HashMap<Name, RoleSet>> {
         const FEW: usize = 8;
         if self.observed.receivers.len() <= FEW {
             return None;
         }
         let mut known = HashMap::new();
         for bound in self.conversation.bound.iter() {
-            *known.entry(bound.agent).or_insert(0) |= 1 << bound.role;
+            *known.entry(bound.agent).or_insert(RoleSet::NONE) |= RoleSet::of(bound.role);
         }
         for agent in self.conversation.reply_to() {
-            *known.entry(*agent).or_insert(0) |= 1 << self.machine.initiator;
+            *known.entry(*agent).or_insert(RoleSet::NONE) |= RoleSet::of(self.machine.initiator);
         }
         Some(known)
     }
@@ -449,11 +450,9 @@ impl Judge<'_> {
 }
 
 /// Returns the roles that no agent has.
-pub(crate) fn unbound(machine: &Machine, conversation: &Conversation) -> u32 {
-    let all = 1_u64.checked_shl(machine.roles.len().try_into().unwrap_or(32));
-    let all = u32::try_from(all.unwrap_or(0).wrapping_sub(1)).unwrap_or(u32::MAX);
-    let bound = conversation.bound.iter();
-    all & !bound.fold(0, |mask, bound| mask | (1 << bound.role))
+pub(crate) fn unbound(machine: &Machine, conversation: &Conversation) -> RoleSet {
+    let bound: RoleSet = conversation.bound.iter().map(|bound| bound.role).collect();
+    RoleSet::first(machine.roles.len()) & !bound
 }
 
 /// Returns the move of a party of which a message of this side was not delivered.

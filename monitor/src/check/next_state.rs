@@ -9,6 +9,7 @@ use crate::conversation::party::{
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FAILED};
 use crate::protocol::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::protocol::machine::{Cancel, Guard, Machine, Roles, Scope, State, Transition, step};
+use crate::protocol::role::{MessageRoles, RoleSet};
 use crate::verdict::ViolationKind as Kind;
 
 /// A message with respect to one party of its conversation.
@@ -17,9 +18,9 @@ pub(crate) struct PartyMessage<'a> {
     pub(crate) act: Act<'a>,
     pub(crate) side: Side,
     /// Roles that the sender may have.
-    pub(crate) from: u32,
+    pub(crate) from: RoleSet,
     /// Roles that every receiver may have.
-    pub(crate) to: u32,
+    pub(crate) to: RoleSet,
     pub(crate) reply_with: u64,
     pub(crate) in_reply_to: u64,
     /// Whether `in-reply-to` can be compared: the conversation has two participants.
@@ -41,8 +42,8 @@ pub(crate) struct NextState {
     /// Whether the message answers one that another message has replaced. It is too late and changes
     /// nothing.
     pub(crate) void: bool,
-    /// Roles of the sender and the receivers in the transition; 0 for none.
-    pub(crate) roles: (u32, u32),
+    /// Roles of the sender and the receivers in the transition; empty for none.
+    pub(crate) roles: MessageRoles,
     pub(crate) guard: Guard,
     /// The state in which the message fits, if it is not the present one.
     pub(crate) before: Option<u16>,
@@ -60,7 +61,7 @@ impl NextState {
             echo: false,
             crossed: false,
             void: false,
-            roles: (0, 0),
+            roles: MessageRoles::NONE,
             guard: Guard::default(),
             before: None,
             world: None,
@@ -85,9 +86,15 @@ impl NextState {
     }
 
     fn taking(step: &Transition) -> Self {
-        let single = |roles: &Roles| if roles.anyone { 0 } else { roles.mask };
+        let listed = |roles: &Roles| match roles.anyone {
+            true => RoleSet::NONE,
+            false => roles.mask,
+        };
         Self {
-            roles: (single(&step.from), single(&step.to)),
+            roles: MessageRoles {
+                from: listed(&step.from),
+                to: listed(&step.to),
+            },
             guard: step.guard,
             ..Self::to(step.target)
         }

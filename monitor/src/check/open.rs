@@ -10,6 +10,7 @@ use crate::conversation::names::Names;
 use crate::conversation::party::Party;
 use crate::monitor::Monitor;
 use crate::protocol::machine::{Machine, Scope, step};
+use crate::protocol::role::RoleSet;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 
 impl Monitor {
@@ -32,7 +33,12 @@ impl Monitor {
             let machine = (machine, protocol);
             return self.open_local(id, machine, &projection, observed, now);
         }
-        let begins = step(&protocol.initial().steps, observed.act, u32::MAX, u32::MAX);
+        let begins = step(
+            &protocol.initial().steps,
+            observed.act,
+            RoleSet::ALL,
+            RoleSet::ALL,
+        );
         let Some(begins) = begins else {
             return Err(match parent {
                 None => self.unopened(id, machine, protocol, observed, now),

@@ -177,18 +177,15 @@ fn agent_of(
     participant: Option<&str>,
 ) -> Option<String> {
     let conversation = conversation?;
-    if roles.anyone || roles.mask.count_ones() != 1 {
-        return None;
-    }
-    let role = roles.mask.trailing_zeros();
-    if role == u32::from(machine.initiator) {
+    let role = roles.one()?;
+    if role == machine.initiator {
         return Some(names.text(conversation.initiator).to_owned());
     }
     match machine.scope {
         Scope::Participant => participant.map(str::to_owned),
         Scope::Conversation => {
             let mut bound = conversation.bound.iter();
-            let bound = bound.find(|bound| u32::from(bound.role) == role)?;
+            let bound = bound.find(|bound| bound.role == role)?;
             Some(names.text(bound.agent).to_owned())
         }
     }

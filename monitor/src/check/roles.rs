@@ -18,6 +18,7 @@ use crate::monitor::Monitor;
 use crate::protocol::act::{CANCEL, FAILURE, NOT_UNDERSTOOD};
 use crate::protocol::machine::Machine;
 use crate::protocol::projection::{LocalRun, NotLocal, Observed, Projection};
+use crate::protocol::role::{Role, RoleSet};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 
 impl Monitor {
@@ -45,7 +46,7 @@ impl Monitor {
             let conversation = &mut slot.conversation;
             conversation.initiator = Some(conversation.acquire(&mut self.names, observed.sender));
             conversation.add(Party::new(None, machine.initial));
-            conversation.rare().local = Some(LocalRun::new(projection.locals(), u32::MAX));
+            conversation.rare().local = Some(LocalRun::new(projection.locals(), RoleSet::ALL));
             conversation.rare().may_continue = !is_certain;
         }
         let passed = self.advance_local(at, projection, observed, now);
@@ -65,7 +66,7 @@ impl Monitor {
         let Some(projection) = projection.filter(|_| self.agent.is_some()) else {
             return false;
         };
-        begun_roles(projection, observed) != 0
+        !begun_roles(projection, observed).is_empty()
     }
 
     /// A violation is none if the state is uncertain: the conversation may have begun before the monitor, a
@@ -78,7 +79,7 @@ impl Monitor {
             let rare = slot.and_then(|slot| slot.conversation.rare.as_deref());
             rare.is_some_and(|rare| {
                 let waits = || rare.local.as_ref().is_some_and(LocalRun::waits);
-                rare.may_continue || rare.contested || rare.uncertain_roles != 0 || waits()
+                rare.may_continue || rare.contested || !rare.uncertain_roles.is_empty() || waits()
             })
         };
         match denied {
@@ -177,7 +178,7 @@ impl Monitor {
                 if let Some(party) = conversation.parties.first_mut() {
                     party.state = state;
                 }
-                if let Some(role) = peer.filter(|role| free & (1 << role) != 0) {
+                if let Some(role) = peer.filter(|role| free.contains(*role)) {
                     let uncertain = || {
                         // The sender of this message, or that of an earlier one, may be an outsider.
                         (own_roles | begun_roles(projection, observed)) & !kept_roles
@@ -221,7 +222,7 @@ impl Monitor {
             }
             // An agent without a role yet may have one.
             Err(_)
-                if (observed.own || peers != 0)
+                if (observed.own || !peers.is_empty())
                     && [CANCEL, FAILURE, NOT_UNDERSTOOD].contains(&observed.act) =>
             {
                 Err(Denied::Unchecked(Unchecked::BegunElsewhere))
@@ -236,10 +237,10 @@ impl Monitor {
                 Err(Denied::Unchecked(Unchecked::UnknownHistory))
             }
             Err(NotLocal::Ended) => fault(Kind::Ended, state),
-            Err(NotLocal::Unexpected) if peers == 0 && !observed.own => {
+            Err(NotLocal::Unexpected) if peers.is_empty() && !observed.own => {
                 fault(Kind::Stranger, state)
             }
-            Err(NotLocal::Unexpected) if peers == 0 => fault(Kind::WrongReceiver, state),
+            Err(NotLocal::Unexpected) if peers.is_empty() => fault(Kind::WrongReceiver, state),
             Err(NotLocal::Unexpected) => fault(Kind::Unexpected, state),
         }
     }
@@ -251,8 +252,8 @@ fn bind(
     conversation: &mut Conversation,
     names: &mut Names,
     observed: &ObservedMessage<'_>,
-    role: u8,
-    uncertain: impl FnOnce() -> u32,
+    role: Role,
+    uncertain: impl FnOnce() -> RoleSet,
 ) {
     let agents = match observed.own {
         true => observed.receivers,
@@ -278,20 +279,20 @@ fn bind(
 /// Returns a conversation after this message, if the message can be the first one that the monitored agent
 /// sees.
 fn begun(projection: &Projection, observed: &ObservedMessage<'_>) -> Option<LocalRun> {
-    let mut run = LocalRun::new(projection.locals(), u32::MAX);
+    let mut run = LocalRun::new(projection.locals(), RoleSet::ALL);
     let message = Observed {
         act: observed.act,
         own: observed.own,
-        peers: u32::MAX,
+        peers: RoleSet::ALL,
     };
     run.take(projection.locals(), message).ok()?;
     Some(run)
 }
 
 /// Returns the roles of the monitored agent of which this is the first message of the protocol.
-fn begun_roles(projection: &Projection, observed: &ObservedMessage<'_>) -> u32 {
+fn begun_roles(projection: &Projection, observed: &ObservedMessage<'_>) -> RoleSet {
     let run = begun(projection, observed).filter(|run| !run.waits());
-    run.map_or(0, |run| run.roles())
+    run.map_or(RoleSet::NONE, |run| run.roles())
 }
 
 /// Takes a message of the monitored agent back, if it is its last one in the conversation, and if no
@@ -334,32 +335,35 @@ fn observed_by_role<'a>(
     conversation: &Conversation,
     names: &Names,
     observed: &ObservedMessage<'a>,
-) -> (u32, Observed<'a>) {
+) -> (RoleSet, Observed<'a>) {
     let run = conversation.rare.as_deref();
     let run = run.and_then(|rare| rare.local.as_ref());
-    let own_role = run.and_then(LocalRun::role).map_or(0, |role| 1 << role);
+    let own_role = run
+        .and_then(LocalRun::role)
+        .map_or(RoleSet::NONE, RoleSet::of);
     let free = unbound(machine, conversation) & !own_role;
     // Roles of which an undelivered message has asked others.
     let asked_others = |name: &str| {
         let asked = conversation.rare.as_deref().map(|rare| &rare.asked);
         let asked = || asked.into_iter().flatten();
-        let others = asked().fold(0, |mask, asked| mask | (1 << asked.role));
+        let others: RoleSet = asked().map(|asked| asked.role).collect();
         let own = asked().filter(|asked| names.is(asked.agent, name));
-        others & !own.fold(0, |mask, asked| mask | (1 << asked.role))
+        others & !own.map(|asked| asked.role).collect::<RoleSet>()
     };
     let may = |name: &str| {
         let bound = conversation.bound.iter();
         let held = bound.filter(|bound| names.is(bound.agent, name));
-        match held.fold(0, |mask, bound| mask | (1 << bound.role)) {
-            0 if observed.own => free,
-            0 => free & !asked_others(name),
-            held => held,
+        let held: RoleSet = held.map(|bound| bound.role).collect();
+        match held.is_empty() {
+            false => held,
+            true if observed.own => free,
+            true => free & !asked_others(name),
         }
     };
     let peers = match observed.own {
         true => {
             let receivers = observed.receivers.iter();
-            receivers.fold(u32::MAX, |all, name| all & may(name))
+            receivers.fold(RoleSet::ALL, |all, name| all & may(name))
         }
         false => may(observed.sender),
     };

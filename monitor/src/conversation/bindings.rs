@@ -5,11 +5,12 @@ use std::ops::{Deref, Range};
 use smallvec::SmallVec;
 
 use crate::conversation::ids::Name;
+use crate::protocol::role::Role;
 
 /// A role and the agent that has it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct RoleBinding {
-    pub(crate) role: u8,
+    pub(crate) role: Role,
     pub(crate) agent: Name,
 }
 

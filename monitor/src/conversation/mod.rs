@@ -28,6 +28,7 @@ use crate::conversation::parties::Parties;
 use crate::conversation::party::Party;
 use crate::conversation::rare::Rare;
 use crate::limits::MAX_DESIGNATED;
+use crate::protocol::role::Role;
 
 /// The order of the fields is that of the memory: see [`Slot`](crate::conversation::table::Slot).
 #[derive(Debug)]
@@ -128,7 +129,7 @@ impl Conversation {
     }
 
     /// Releases the names of [`Rare::asked`], of the roles for which `is_known` holds.
-    pub(crate) fn release_asked(&mut self, names: &mut Names, is_known: impl Fn(u8) -> bool) {
+    pub(crate) fn release_asked(&mut self, names: &mut Names, is_known: impl Fn(Role) -> bool) {
         let Some(rare) = self.rare.as_deref_mut() else {
             return;
         };
@@ -255,6 +256,7 @@ mod tests {
     use crate::conversation::party::{Details, EARLIER, Side, Worlds};
     use crate::conversation::rare::Copied;
     use crate::conversation::state::FAILED;
+    use crate::protocol::role::MessageRoles;
 
     #[test]
     fn what_parties_allocate_is_counted_and_one_buffer_is_kept() {
@@ -282,7 +284,10 @@ mod tests {
         let both = conversation.parties.allocated();
         assert_eq!(both, uncertain + 2 * size_of::<Party>());
         let agent = conversation.acquire(&mut names, "ann");
-        conversation.bound.push(RoleBinding { role: 0, agent });
+        conversation.bound.push(RoleBinding {
+            role: Role::new(0),
+            agent,
+        });
         let bound = size_of::<SmallVec<[RoleBinding; 2]>>();
         assert_eq!(conversation.allocated(), both + bound + Names::cost(3));
         conversation.clear();
@@ -305,7 +310,10 @@ mod tests {
         let fill = |conversation: &mut Conversation| {
             for agent in (0..20).map(Name::new) {
                 conversation.add(Party::new(Some(agent), 0));
-                conversation.bound.push(RoleBinding { role: 0, agent });
+                conversation.bound.push(RoleBinding {
+                    role: Role::new(0),
+                    agent,
+                });
             }
             for party in conversation.parties.iter_mut().take(7) {
                 party.begin_step(Side::Initiator, 1, 7, false);
@@ -322,13 +330,16 @@ mod tests {
             rare.delegates.extend((0..5).map(delegate));
             let party = Some(PartyIndex::new(0));
             rare.alternatives.extend((0..7).map(|state| (party, state)));
-            let asked = |agent| RoleBinding { role: 0, agent };
+            let asked = |agent| RoleBinding {
+                role: Role::new(0),
+                agent,
+            };
             rare.asked.extend((0..3).map(Name::new).map(asked));
             for receivers in [2, 9] {
                 rare.copied.push(Copied {
                     fingerprint: 0,
                     seen: (0..receivers).collect(),
-                    roles: (0, 0),
+                    roles: MessageRoles::NONE,
                 });
             }
         };
@@ -362,13 +373,16 @@ mod tests {
                 rare.copied.push(Copied {
                     fingerprint: 0,
                     seen: Vec::with_capacity(receivers),
-                    roles: (0, 0),
+                    roles: MessageRoles::NONE,
                 });
             });
             assert_eq!(bytes, receivers * size_of::<u64>());
         }
         let agent = Name::new(0);
-        let asked = RoleBinding { role: 0, agent };
+        let asked = RoleBinding {
+            role: Role::new(0),
+            agent,
+        };
         assert_eq!(added(&|rare| rare.asked.push(asked)), 0);
         let bytes = added(&|rare| rare.asked.grow(5));
         assert_eq!(bytes, 5 * size_of::<RoleBinding>());
@@ -397,7 +411,10 @@ mod tests {
                     for number in numbers {
                         let agent = names.acquire(&number.to_string());
                         conversation.add(Party::new(Some(agent), 0));
-                        conversation.bound.push(RoleBinding { role: 0, agent });
+                        conversation.bound.push(RoleBinding {
+                            role: Role::new(0),
+                            agent,
+                        });
                     }
                 };
                 grow(&mut conversation, 0..before);

@@ -7,6 +7,7 @@ use crate::conversation::bindings::RoleBinding;
 use crate::conversation::ids::{Name, PartyIndex};
 use crate::conversation::party::Party;
 use crate::protocol::projection::LocalRun;
+use crate::protocol::role::{MessageRoles, RoleSet};
 
 /// The parts of a conversation that most conversations do not have.
 #[derive(Debug, Default)]
@@ -32,7 +33,7 @@ pub(crate) struct Rare {
     /// conversation, or because another agent may have that role.
     pub(crate) contested: bool,
     /// Roles that the monitored agent may have, because the message that excludes them may be of an outsider.
-    pub(crate) uncertain_roles: u32,
+    pub(crate) uncertain_roles: RoleSet,
     /// Whether the last message of the monitored agent was reported as undelivered.
     pub(crate) undelivered: bool,
     /// Whether only a message of an agent that claimed a role has shown that such a message arrived.
@@ -94,7 +95,7 @@ pub(crate) struct Copied {
     /// Fingerprints of the receivers of the copies.
     pub(crate) seen: Vec<u64>,
     /// Roles of the sender and the receivers.
-    pub(crate) roles: (u32, u32),
+    pub(crate) roles: MessageRoles,
 }
 
 impl Copied {

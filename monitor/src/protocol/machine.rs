@@ -6,8 +6,8 @@ use std::time::Duration;
 use fipa_acl::Pattern;
 
 use crate::protocol::act::{Act, Acts, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
-
 use crate::protocol::projection::Projection;
+use crate::protocol::role::{Role, RoleSet};
 
 /// Maximum number of roles of a protocol.
 pub(crate) const MAX_ROLES: usize = 32;
@@ -29,7 +29,7 @@ pub struct Machine {
     pub(crate) failure_by_parties: bool,
     pub(crate) roles: Vec<String>,
     /// Index of the initiating role.
-    pub(crate) initiator: u8,
+    pub(crate) initiator: Role,
     pub(crate) initial: u16,
     pub(crate) states: Vec<State>,
     /// The protocol as each role sees it, if it has three or more roles and can be projected.
@@ -123,7 +123,7 @@ pub enum After {
 pub(crate) struct Roles {
     pub(crate) text: String,
     /// A bit for each role of the machine.
-    pub(crate) mask: u32,
+    pub(crate) mask: RoleSet,
     /// Whether it stands for any agent, with a role or without (`.*`).
     pub(crate) anyone: bool,
 }
@@ -168,7 +168,7 @@ impl Machine {
     /// The initiating role.
     #[must_use]
     pub fn initiator(&self) -> &str {
-        let role = self.roles.get(usize::from(self.initiator));
+        let role = self.roles.get(self.initiator.index());
         role.map_or("", String::as_str)
     }
 
@@ -220,7 +220,7 @@ impl Machine {
 
     /// Whether the initiator may send this to another agent in any state.
     pub(crate) fn is_sent_by_initiator(&self, act: Act<'_>) -> bool {
-        let initiator = 1_u32 << self.initiator;
+        let initiator = RoleSet::of(self.initiator);
         let sends = |state: &State| step(&state.transitions, act, initiator, !initiator).is_some();
         [CANCEL, NOT_UNDERSTOOD].contains(&act) || self.states.iter().any(sends)
     }
@@ -273,7 +273,7 @@ impl Machine {
 
     /// Whether another agent may send this to the initiator in any state.
     pub(crate) fn is_answer(&self, act: Act<'_>) -> bool {
-        let initiator = 1_u32 << self.initiator;
+        let initiator = RoleSet::of(self.initiator);
         let answers =
             |state: &State| step(&state.transitions, act, !initiator, initiator).is_some();
         act == NOT_UNDERSTOOD || self.states.iter().any(answers)
@@ -402,18 +402,18 @@ impl Timeout {
 }
 
 impl Roles {
-    /// Returns the bit of the role, if it is the only one.
-    pub(crate) fn one(&self) -> Option<u32> {
-        (!self.anyone && self.mask.is_power_of_two()).then_some(self.mask)
+    /// Returns the role, if it is the only one.
+    pub(crate) fn one(&self) -> Option<Role> {
+        self.mask.only().filter(|_| !self.anyone)
     }
 
     #[inline]
-    pub(crate) fn includes(&self, mask: u32) -> bool {
-        self.anyone || self.mask & mask != 0
+    pub(crate) fn includes(&self, roles: RoleSet) -> bool {
+        self.anyone || self.mask.intersects(roles)
     }
 
     pub(crate) fn overlaps(&self, other: &Self) -> bool {
-        self.anyone || other.anyone || self.mask & other.mask != 0
+        self.anyone || other.anyone || self.mask.intersects(other.mask)
     }
 }
 
@@ -422,8 +422,8 @@ impl Roles {
 pub(crate) fn step<'m>(
     steps: &'m [Transition],
     act: Act<'_>,
-    from: u32,
-    to: u32,
+    from: RoleSet,
+    to: RoleSet,
 ) -> Option<&'m Transition> {
     steps
         .iter()
@@ -449,7 +449,7 @@ mod tests {
             <state id="1"><transition performative="request" from="a" to="b" target="0"/></state>
             <state id="2" final="yes"/></scxml>"#;
         let machine = Machine::read("own", text).unwrap();
-        assert_eq!((machine.initiator(), machine.initiator), ("a", 1));
+        assert_eq!((machine.initiator(), machine.initiator.get()), ("a", 1));
         let [request, agree] = ["request", "agree"].map(Act::named);
         assert!(machine.is_sent_by_initiator(request) && !machine.is_sent_by_initiator(agree));
         assert!(machine.is_answer(agree) && !machine.is_answer(request));
@@ -458,13 +458,13 @@ mod tests {
 
     #[test]
     fn any_role_overlaps_each_role() {
-        let roles = |mask, anyone| Roles {
+        let roles = |count: usize, anyone| Roles {
             text: String::new(),
-            mask,
+            mask: RoleSet::first(count) & !RoleSet::first(count / 2),
             anyone,
         };
-        let (one, other, any) = (roles(1, false), roles(6, false), roles(0, true));
-        assert!(one.overlaps(&one) && other.overlaps(&roles(4, false)));
+        let (one, other, any) = (roles(1, false), roles(4, false), roles(0, true));
+        assert!(one.overlaps(&one) && other.overlaps(&roles(3, false)));
         assert!(any.overlaps(&one) && one.overlaps(&any) && any.overlaps(&any));
         assert!(!one.overlaps(&other) && !other.overlaps(&one));
     }

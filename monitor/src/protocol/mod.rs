@@ -6,5 +6,6 @@ pub(crate) mod act;
 pub(crate) mod library;
 pub(crate) mod machine;
 pub mod projection;
+pub(crate) mod role;
 pub mod scxml;
 pub(crate) mod spelling;

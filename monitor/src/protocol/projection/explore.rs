@@ -2,7 +2,7 @@
 
 use std::collections::{HashSet, VecDeque};
 
-use super::{Defect, Local, LocalState, Performed, Projection, role_name};
+use super::{Defect, Local, LocalState, Performed, Projection};
 use crate::protocol::machine::Machine;
 
 /// Maximum number of messages that wait between two roles.
@@ -70,8 +70,8 @@ impl Configuration {
         for (at, (local, state)) in locals.iter().zip(&self.states).enumerate() {
             let steps = local.state(*state).map_or(&[][..], LocalState::steps);
             for step in steps {
-                let queue = usize::from(step.label.from) * locals.len();
-                let queue = queue + usize::from(step.label.to);
+                let queue = step.label.from.index() * locals.len();
+                let queue = queue + step.label.to.index();
                 let sends = step.label.from == local.role;
                 let Some(waiting) = self.queues.get(queue) else {
                     continue;
@@ -113,7 +113,7 @@ impl Configuration {
             {
                 defects.push(Defect::Unexpected {
                     performative: act.name().to_owned(),
-                    from: role_name(machine, u8::try_from(from).unwrap_or(0)).to_owned(),
+                    from: machine.roles.get(from).cloned().unwrap_or_default(),
                     to: local.role().to_owned(),
                     state: shown(local, *state),
                 });

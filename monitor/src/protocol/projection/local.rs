@@ -3,11 +3,12 @@
 use super::{Label, Performed};
 use crate::protocol::act::Act;
 use crate::protocol::machine::Machine;
+use crate::protocol::role::{Role, RoleSet};
 
 /// A protocol as one role sees it.
 #[derive(Debug, Clone)]
 pub struct Local {
-    pub(crate) role: u8,
+    pub(crate) role: Role,
     pub(super) name: String,
     pub(super) roles: Vec<String>,
     pub(crate) states: Vec<LocalState>,
@@ -54,8 +55,8 @@ impl Local {
         self.name_of(step.label.to)
     }
 
-    fn name_of(&self, role: u8) -> &str {
-        let role = self.roles.get(usize::from(role));
+    fn name_of(&self, role: Role) -> &str {
+        let role = self.roles.get(role.index());
         role.map_or("", String::as_str)
     }
 
@@ -133,7 +134,7 @@ pub(crate) struct Observed<'a> {
     /// Whether the agent sends it.
     pub(crate) own: bool,
     /// Roles that the other side may have.
-    pub(crate) peers: u32,
+    pub(crate) peers: RoleSet,
 }
 
 /// A message that does not fit.
@@ -157,10 +158,10 @@ pub(crate) struct LocalRun {
 /// A possible role of the agent, and its state.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Part {
-    role: u8,
+    role: Role,
     state: u16,
     /// Messages that came before their turn, because messages of other senders are under way.
-    early: Vec<(u8, Performed)>,
+    early: Vec<(Role, Performed)>,
 }
 
 /// Maximum number of early messages.
@@ -170,8 +171,8 @@ const MAX_SEARCHED: usize = 256;
 
 impl LocalRun {
     /// A conversation that has not begun, in which the agent may have any of these roles.
-    pub(crate) fn new(locals: &[Local], roles: u32) -> Self {
-        let parts = locals.iter().filter(|local| roles & (1 << local.role) != 0);
+    pub(crate) fn new(locals: &[Local], roles: RoleSet) -> Self {
+        let parts = locals.iter().filter(|local| roles.contains(local.role));
         let part = |local: &Local| Part {
             role: local.role,
             state: 0,
@@ -184,17 +185,15 @@ impl LocalRun {
     }
 
     /// The role of the agent, if it is certain.
-    pub(crate) fn role(&self) -> Option<u8> {
+    pub(crate) fn role(&self) -> Option<Role> {
         let first = self.parts.first()?.role;
         let mut parts = self.parts.iter();
         parts.all(|part| part.role == first).then_some(first)
     }
 
     /// The roles that the agent may have.
-    pub(crate) fn roles(&self) -> u32 {
-        self.parts
-            .iter()
-            .fold(0, |mask, part| mask | (1 << part.role))
+    pub(crate) fn roles(&self) -> RoleSet {
+        self.parts.iter().map(|part| part.role).collect()
     }
 
     /// Whether the role and the state of the agent are certain.
@@ -215,7 +214,7 @@ impl LocalRun {
                 Performed::Standard(_) => 0,
                 Performed::Other(name) => name.capacity(),
             });
-            let buffer = part.early.capacity() * size_of::<(u8, Performed)>();
+            let buffer = part.early.capacity() * size_of::<(Role, Performed)>();
             std::iter::once(buffer).chain(acts)
         });
         let parts = self.parts.capacity() + self.without_last.capacity();
@@ -244,7 +243,7 @@ impl LocalRun {
         &mut self,
         locals: &[Local],
         message: Observed<'_>,
-    ) -> Result<(Option<u8>, Option<u8>), NotLocal> {
+    ) -> Result<(Option<Role>, Option<Role>), NotLocal> {
         let local = |part: &Part| locals.iter().find(|local| local.role == part.role);
         let taken = after(&self.parts, locals, message);
         if taken.is_empty() {
@@ -257,7 +256,7 @@ impl LocalRun {
                 false => NotLocal::Unexpected,
             });
         }
-        let same = |one: &dyn Fn(&(Part, u8)) -> u8| {
+        let same = |one: &dyn Fn(&(Part, Role)) -> Role| {
             let first = taken.first().map(one);
             first.filter(|first| taken.iter().all(|part| one(part) == *first))
         };
@@ -288,7 +287,7 @@ impl LocalRun {
 }
 
 /// The parts after a message, and the roles of the other side.
-fn after(parts: &[Part], locals: &[Local], message: Observed<'_>) -> Vec<(Part, u8)> {
+fn after(parts: &[Part], locals: &[Local], message: Observed<'_>) -> Vec<(Part, Role)> {
     let with_local = || {
         parts.iter().filter_map(|part| {
             let local = locals.iter().find(|local| local.role == part.role);
@@ -296,7 +295,7 @@ fn after(parts: &[Part], locals: &[Local], message: Observed<'_>) -> Vec<(Part, 
         })
     };
     let taken = with_local().filter_map(|(part, local)| part.after(local, message));
-    let taken: Vec<(Part, u8)> = taken.collect();
+    let taken: Vec<(Part, Role)> = taken.collect();
     if !taken.is_empty() || message.own {
         return taken;
     }
@@ -307,7 +306,7 @@ fn after(parts: &[Part], locals: &[Local], message: Observed<'_>) -> Vec<(Part, 
 
 impl Part {
     /// The part after a message whose turn it is, and the role of the other side.
-    fn after(&self, local: &Local, message: Observed<'_>) -> Option<(Self, u8)> {
+    fn after(&self, local: &Local, message: Observed<'_>) -> Option<(Self, Role)> {
         let state = local.state(self.state)?;
         let step = state.steps.iter().find(|step| {
             let peer = match message.own {
@@ -315,7 +314,7 @@ impl Part {
                 false => step.label.from,
             };
             (step.label.from == self.role) == message.own
-                && message.peers & (1 << peer) != 0
+                && message.peers.contains(peer)
                 && step.label.act.is(message.act)
         })?;
         let mut part = self.clone();
@@ -349,13 +348,13 @@ impl Part {
     }
 
     /// The part with a message whose turn comes after messages of other roles. It does not fit now.
-    fn keeping(&self, local: &Local, message: Observed<'_>) -> Option<(Self, u8)> {
+    fn keeping(&self, local: &Local, message: Observed<'_>) -> Option<(Self, Role)> {
         if self.early.len() == MAX_EARLY {
             return None;
         }
         // The messages of the sender that wait already. Its messages arrive in their order.
         let of_sender = self.early.iter();
-        let of_sender = of_sender.filter(|(from, _)| message.peers == 1 << from);
+        let of_sender = of_sender.filter(|(from, _)| message.peers.only() == Some(*from));
         let waiting: Vec<&Performed> = of_sender.map(|(_, act)| act).collect();
         let mut reached = vec![(self.state, 0)];
         let mut next = 0;
@@ -364,14 +363,14 @@ impl Part {
             let steps = local.state(at).map_or(&[][..], LocalState::steps);
             for step in steps.iter().filter(|step| step.label.from != self.role) {
                 let Label { from, act, .. } = &step.label;
-                let fits = message.peers & (1 << from) != 0 && act.is(message.act);
+                let fits = message.peers.contains(*from) && act.is(message.act);
                 if fits && taken == waiting.len() {
                     let mut part = self.clone();
                     part.early.push((*from, act.clone()));
                     return Some((part, *from));
                 }
                 // Messages of other senders can be under way.
-                let taken = match message.peers == 1 << from {
+                let taken = match message.peers.only() == Some(*from) {
                     true if waiting.get(taken) == Some(&act) => taken + 1,
                     true => continue,
                     false => taken,
@@ -403,9 +402,9 @@ mod tests {
         let message = |act| Observed {
             act,
             own: false,
-            peers: u32::MAX,
+            peers: RoleSet::ALL,
         };
-        let mut run = LocalRun::new(locals, u32::MAX);
+        let mut run = LocalRun::new(locals, RoleSet::ALL);
         let parts = |run: &LocalRun| run.parts.capacity() * size_of::<Part>();
         assert!(run.parts.len() == 3 && run.allocated() == parts(&run));
         // The message waits for the request.
@@ -414,10 +413,10 @@ mod tests {
         let [part] = &run.parts[..] else {
             panic!("{run:?}")
         };
-        let early = part.early.capacity() * size_of::<(u8, Performed)>() + "own-act".len();
+        let early = part.early.capacity() * size_of::<(Role, Performed)>() + "own-act".len();
         assert_eq!(run.allocated(), parts(&run) + early);
         // A sent message may not have arrived.
-        let mut run = LocalRun::new(locals, u32::MAX);
+        let mut run = LocalRun::new(locals, RoleSet::ALL);
         let request = Observed {
             own: true,
             ..message(Act::named("request"))

@@ -39,6 +39,7 @@ use std::collections::{BTreeSet, HashMap};
 
 use crate::protocol::act::{Act, Acts};
 use crate::protocol::machine::{Machine, Roles, Scope, State, Transition};
+use crate::protocol::role::{Role, RoleSet};
 
 pub use local::{Local, LocalState, LocalStep};
 pub(crate) use local::{LocalRun, NotLocal, Observed};
@@ -133,8 +134,8 @@ fn listed(waiting: &[(String, String)]) -> String {
 /// A message between two roles.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct Label {
-    pub(crate) from: u8,
-    pub(crate) to: u8,
+    pub(crate) from: Role,
+    pub(crate) to: Role,
     pub(crate) act: Performed,
 }
 
@@ -178,7 +179,7 @@ impl Projection {
         }
         let mut locals = Vec::new();
         if defects.is_empty() {
-            for role in (0..).take(machine.roles.len()) {
+            for role in (0..).map(Role::new).take(machine.roles.len()) {
                 locals.extend(project(machine, &steps, role, &mut defects));
             }
         }
@@ -196,13 +197,13 @@ impl Projection {
     }
 
     /// The roles that send this performative in some state.
-    pub(crate) fn senders_of(&self, act: Act<'_>) -> u32 {
+    pub(crate) fn senders_of(&self, act: Act<'_>) -> RoleSet {
         let sends = |local: &&Local| {
             let mut steps = local.states().iter().flat_map(LocalState::steps);
             steps.any(|step| step.label.from == local.role && step.label.act.is(act))
         };
         let senders = self.locals.iter().filter(sends);
-        senders.fold(0, |mask, local| mask | (1 << local.role))
+        senders.map(|local| local.role).collect()
     }
 
     /// Runs all roles against each other, with queues of bounded length between them, and returns the
@@ -232,7 +233,7 @@ impl Projection {
             mixed_choices(machine, &steps, &mut defects);
         }
         let mut locals = Vec::new();
-        for role in (0..).take(machine.roles.len()) {
+        for role in (0..).map(Role::new).take(machine.roles.len()) {
             locals.extend(project(machine, &steps, role, &mut defects));
         }
         if locals.len() == machine.roles.len() && machine.roles.len() > 2 {
@@ -262,9 +263,9 @@ fn steps(machine: &Machine, defects: &mut Vec<Defect>) -> Steps {
 }
 
 fn labels(step: &Transition) -> Result<Vec<Label>, (&'static str, &str)> {
-    let single = |what, roles: &Roles| match (roles.anyone, roles.mask) {
-        (true, _) | (_, 0) => Err(what),
-        (_, mask) => Ok((0..32_u8).filter(move |role| mask & (1 << role) != 0)),
+    let single = |what, roles: &Roles| match roles.anyone || roles.mask.is_empty() {
+        true => Err(what),
+        false => Ok(roles.mask.iter()),
     };
     let from = single("from", &step.from).map_err(|what| (what, step.from.text.as_str()))?;
     let to = single("to", &step.to).map_err(|what| (what, step.to.text.as_str()))?;
@@ -314,8 +315,8 @@ fn mixed_choices(machine: &Machine, steps: &Steps, defects: &mut Vec<Defect>) {
     }
 }
 
-pub(crate) fn role_name(machine: &Machine, role: u8) -> &str {
-    let role = machine.roles.get(usize::from(role));
+pub(crate) fn role_name(machine: &Machine, role: Role) -> &str {
+    let role = machine.roles.get(role.index());
     role.map_or("", String::as_str)
 }
 
@@ -330,7 +331,7 @@ struct Unseen {
 
 impl Unseen {
     /// Adds all states that messages between other roles, and timeouts, lead to.
-    fn closed(machine: &Machine, steps: &Steps, role: u8, from: BTreeSet<u16>) -> Self {
+    fn closed(machine: &Machine, steps: &Steps, role: Role, from: BTreeSet<u16>) -> Self {
         let hidden = |all: &mut BTreeSet<u16>| {
             let mut next: Vec<u16> = all.iter().copied().collect();
             while let Some(state) = next.pop() {
@@ -370,7 +371,12 @@ impl Unseen {
 }
 
 /// Projects a protocol onto a role: determinizes it by subsets of states.
-fn project(machine: &Machine, steps: &Steps, role: u8, defects: &mut Vec<Defect>) -> Option<Local> {
+fn project(
+    machine: &Machine,
+    steps: &Steps,
+    role: Role,
+    defects: &mut Vec<Defect>,
+) -> Option<Local> {
     let first = Unseen::closed(machine, steps, role, BTreeSet::from([machine.initial]));
     let mut numbers = HashMap::from([(first.clone(), 0_u16)]);
     let mut sets = vec![first];
@@ -420,7 +426,7 @@ fn project(machine: &Machine, steps: &Steps, role: u8, defects: &mut Vec<Defect>
 }
 
 /// Finds the messages that a role may send in one of these states and not in another.
-fn not_told(machine: &Machine, steps: &Steps, role: u8, set: &Unseen, defects: &mut Vec<Defect>) {
+fn not_told(machine: &Machine, steps: &Steps, role: Role, set: &Unseen, defects: &mut Vec<Defect>) {
     let sends = |state: u16, label: &Label| {
         let steps = steps.get(usize::from(state)).into_iter().flatten();
         steps.clone().any(|(known, _)| known == label)

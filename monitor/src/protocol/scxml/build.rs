@@ -13,6 +13,7 @@ use crate::protocol::machine::{
     After, Cancel, Guard, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
 };
 use crate::protocol::projection::Projection;
+use crate::protocol::role::{Role, RoleSet};
 use crate::protocol::spelling::one_edit_apart;
 
 /// Maximum number of transitions of a state, including those behind optional transitions.
@@ -86,7 +87,7 @@ impl<'d> Builder<'d> {
             cancel: self.cancel(),
             failure_by_parties: !document.extended,
             roles: self.roles.clone(),
-            initiator: 0,
+            initiator: Role::new(0),
             initial: initial?,
             states,
             projection: None,
@@ -302,14 +303,14 @@ impl<'d> Builder<'d> {
             Ok(pattern) => pattern,
             Err(error) => return self.no_pattern(line, attribute, text, &error),
         };
-        let mut mask = 0;
-        for (number, role) in self.roles.iter().enumerate() {
+        let mut mask = RoleSet::NONE;
+        for (number, role) in (0..).map(Role::new).zip(&self.roles) {
             if pattern.matches(role) {
-                mask |= 1 << number;
+                mask |= RoleSet::of(number);
             }
         }
         let anyone = text == ".*";
-        if mask == 0 && !anyone {
+        if mask.is_empty() && !anyone {
             self.wrong(line, Problem::UnboundRole(text.to_owned()));
             return None;
         }
@@ -326,9 +327,9 @@ impl<'d> Builder<'d> {
     fn bound_roles(&mut self, machine: &Machine) {
         let all = || machine.states.iter().flat_map(|state| &state.transitions);
         let begin = &machine.initial().transitions;
-        for (number, role) in machine.roles.iter().enumerate() {
-            let bit = 1 << number;
-            let first = begin.iter().any(|step| step.from.mask & bit != 0);
+        for (number, role) in (0..).map(Role::new).zip(&machine.roles) {
+            let bit = RoleSet::of(number);
+            let first = begin.iter().any(|step| step.from.mask.contains(number));
             let addressed = all().any(|step| step.to.includes(bit));
             let states = machine.states.iter().enumerate();
             let mut sent = states.flat_map(|(at, state)| {
@@ -438,16 +439,16 @@ impl<'d> Builder<'d> {
         }
     }
 
-    fn beginner(&mut self, machine: &Machine) -> Option<u8> {
+    fn beginner(&mut self, machine: &Machine) -> Option<Role> {
         let line = self.line_of(usize::from(machine.initial));
         let initial = machine.state(machine.initial)?;
         let mask = initial
             .steps
             .iter()
-            .fold(0, |mask, step| mask | step.from.mask);
-        if mask.count_ones() > 1 {
-            let begins = |(number, _): &(usize, &String)| mask & (1 << number) != 0;
-            let roles = self.roles.iter().enumerate().filter(begins);
+            .fold(RoleSet::NONE, |mask, step| mask | step.from.mask);
+        if mask.iter().count() > 1 {
+            let roles = (0..).map(Role::new).zip(&self.roles);
+            let roles = roles.filter(|(number, _)| mask.contains(*number));
             let roles: Vec<&str> = roles.map(|(_, role)| role.as_str()).collect();
             self.wrong(line, Problem::Beginners(roles.join(", ")));
         }
@@ -455,7 +456,7 @@ impl<'d> Builder<'d> {
             let problem = Problem::RolesOfScope(self.roles.len(), self.roles.join(", "));
             self.wrong(self.document.line, problem);
         }
-        u8::try_from(mask.trailing_zeros() % 32).ok()
+        Some(mask.iter().next().unwrap_or(Role::new(0)))
     }
 
     fn aliases(&mut self) -> Vec<String> {
