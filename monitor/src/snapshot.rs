@@ -35,6 +35,7 @@ use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FA
 use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::monitor::Monitor;
 use crate::protocol::act::Act;
+use crate::protocol::index::{MachineIndex, StateId};
 use crate::protocol::machine::{Machine, Scope};
 use crate::protocol::role::Role;
 use crate::{Library, Moment, MonitorLimits};
@@ -295,9 +296,9 @@ fn put_count(out: &mut Vec<u8>, count: usize) {
     out.extend_from_slice(&count.to_le_bytes());
 }
 
-const SPECIAL: [u16; 4] = [AFTER_NOT_UNDERSTOOD, CANCELLING, CANCELLED, FAILED];
+const SPECIAL: [StateId; 4] = [AFTER_NOT_UNDERSTOOD, CANCELLING, CANCELLED, FAILED];
 
-fn put_state(machine: &Machine, state: u16, out: &mut Vec<u8>) -> Option<()> {
+fn put_state(machine: &Machine, state: StateId, out: &mut Vec<u8>) -> Option<()> {
     if let Some(special) = SPECIAL.iter().position(|special| *special == state) {
         out.push(u8::try_from(special + 1).ok()?);
         return Some(());
@@ -357,7 +358,7 @@ struct Read<'s> {
 
 /// A conversation of a snapshot.
 struct Part<'s> {
-    machine: u16,
+    machine: MachineIndex,
     id: &'s str,
     peer: &'s str,
     initiator: &'s str,
@@ -610,7 +611,7 @@ impl<'s> Input<'s> {
             return malformed("an uncertain state");
         }
         // The state after a cancel that fails.
-        let is_own = |state: u16| !SPECIAL.contains(&state);
+        let is_own = |state: StateId| !SPECIAL.contains(&state);
         if [CANCELLING, AFTER_NOT_UNDERSTOOD].contains(&state) && !is_own(resume) {
             return malformed("a state to resume");
         }
@@ -661,14 +662,14 @@ impl<'s> Input<'s> {
         Ok((peer, party))
     }
 
-    fn state(&mut self, machine: Option<&Machine>) -> Result<u16, SnapshotError> {
+    fn state(&mut self, machine: Option<&Machine>) -> Result<StateId, SnapshotError> {
         let special = match self.u8()? {
             0 => {
                 let name = self.text()?;
                 let Some(machine) = machine else {
-                    return Ok(0);
+                    return Ok(StateId::FIRST);
                 };
-                let mut all = (0_u16..).zip(&machine.states);
+                let mut all = (0..).map(StateId::new).zip(&machine.states);
                 let found = all.find(|(_, state)| state.id() == name);
                 return found
                     .map(|(at, _)| at)

@@ -9,6 +9,7 @@ use crate::conversation::Conversation;
 use crate::conversation::ids::{PartyIndex, SlotIndex};
 use crate::conversation::state::{CANCELLED, CANCELLING, FAILED};
 use crate::monitor::Monitor;
+use crate::protocol::index::StateId;
 use crate::protocol::machine::{Machine, Scope, step};
 use crate::protocol::role::RoleSet;
 use crate::verdict::Unchecked;
@@ -148,6 +149,6 @@ pub(crate) fn keep_alternatives(
 /// The entry of [`Rare::alternatives`](crate::conversation::Rare::alternatives) of a party after an
 /// undelivered message: the state before the first known message is unknown, and a message that has ruled
 /// out states has no effect.
-pub(crate) fn any_state_of(party: usize) -> (Option<PartyIndex>, u16) {
+pub(crate) fn any_state_of(party: usize) -> (Option<PartyIndex>, StateId) {
     (Some(PartyIndex::new(party)), FAILED)
 }

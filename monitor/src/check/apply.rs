@@ -13,6 +13,7 @@ use crate::conversation::ids::PartyIndex;
 use crate::conversation::names::Names;
 use crate::conversation::party::{Party, Side, act_number, side_index};
 use crate::conversation::state::{CANCELLING, FAILED};
+use crate::protocol::index::StateId;
 use crate::protocol::machine::{After, Machine, Scope};
 use crate::protocol::role::{MessageRoles, Role, RoleSet};
 
@@ -47,7 +48,7 @@ pub(crate) struct Change<'a> {
     pub(crate) opened: bool,
     pub(crate) late: bool,
     pub(crate) void: bool,
-    pub(crate) state: Option<u16>,
+    pub(crate) state: Option<StateId>,
 }
 
 impl Change<'_> {

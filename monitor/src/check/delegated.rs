@@ -24,6 +24,7 @@ use crate::conversation::party::{Party, Side, act_number, side_index};
 use crate::conversation::state::ELSEWHERE;
 use crate::monitor::Monitor;
 use crate::protocol::act::{Act, FAILURE, INFORM};
+use crate::protocol::index::{MachineIndex, StateId};
 use crate::protocol::machine::{Cancel, Machine, Scope, step};
 use crate::protocol::role::RoleSet;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
@@ -52,7 +53,7 @@ impl Monitor {
         &mut self,
         id: &str,
         parent: Option<SlotIndex>,
-        machine: u16,
+        machine: MachineIndex,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<(), Denied> {
@@ -179,7 +180,7 @@ impl Monitor {
 
 /// Returns the state to which this answer leads from any reachable state, or [`ELSEWHERE`] if there
 /// are several. Timeouts do not count: the `reply-by` of the question is unknown.
-fn after(machine: &Machine, act: Act<'_>) -> u16 {
+fn after(machine: &Machine, act: Act<'_>) -> StateId {
     let initiator = RoleSet::of(machine.initiator);
     let mut reached = vec![machine.initial];
     let (mut next, mut found) = (0, None);

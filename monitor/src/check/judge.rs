@@ -405,12 +405,12 @@ impl Judge<'_> {
             let peer = self.names.text(party.peer);
             Err(self.fault(Kind::Guard, party, peer))
         };
-        if guard.at_most > 0 {
+        if let Some(at_most) = guard.at_most {
             let reach = moves
                 .iter()
                 .filter(|party_move| party_move.next_state.state == target);
             let there = others().filter(|(party, _)| party.state == target);
-            if reach.count() + there.clone().count() > usize::from(guard.at_most) {
+            if reach.count() + there.clone().count() > usize::from(at_most.get()) {
                 let mut blocking = there
                     .map(|(party, _)| party)
                     .chain(conversation.parties.iter());

@@ -8,6 +8,7 @@ use crate::conversation::party::{
 };
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FAILED};
 use crate::protocol::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+use crate::protocol::index::StateId;
 use crate::protocol::machine::{Cancel, Guard, Machine, Roles, Scope, State, Transition, step};
 use crate::protocol::role::{MessageRoles, RoleSet};
 use crate::verdict::ViolationKind as Kind;
@@ -34,8 +35,8 @@ pub(crate) struct PartyMessage<'a> {
 /// The state after a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct NextState {
-    pub(crate) state: u16,
-    pub(crate) resume: u16,
+    pub(crate) state: StateId,
+    pub(crate) resume: StateId,
     pub(crate) echo: bool,
     /// Whether the message was sent before its sender had received the last one.
     pub(crate) crossed: bool,
@@ -46,7 +47,7 @@ pub(crate) struct NextState {
     pub(crate) roles: MessageRoles,
     pub(crate) guard: Guard,
     /// The state in which the message fits, if it is not the present one.
-    pub(crate) before: Option<u16>,
+    pub(crate) before: Option<StateId>,
     /// Whether the message shows that one reported as failed has arrived, or that it has not.
     pub(crate) world: Option<World>,
     /// Whether the message answers a cancel, and is no step of the protocol itself.
@@ -54,7 +55,7 @@ pub(crate) struct NextState {
 }
 
 impl NextState {
-    pub(crate) fn to(state: u16) -> Self {
+    pub(crate) fn to(state: StateId) -> Self {
         Self {
             state,
             resume: state,
@@ -78,7 +79,7 @@ impl NextState {
         }
     }
 
-    fn not_understood_in(state: u16) -> Self {
+    fn not_understood_in(state: StateId) -> Self {
         Self {
             resume: state,
             ..Self::to(AFTER_NOT_UNDERSTOOD)
@@ -325,7 +326,7 @@ fn while_cancelling(
 fn in_state(
     machine: &Machine,
     party: &Party,
-    state: u16,
+    state: StateId,
     message: &PartyMessage<'_>,
 ) -> Result<NextState, Kind> {
     let Some(current) = machine.state(state) else {
@@ -347,7 +348,7 @@ fn in_state(
 fn without_step(
     machine: &Machine,
     party: &Party,
-    state: u16,
+    state: StateId,
     message: &PartyMessage<'_>,
 ) -> Result<NextState, Kind> {
     let embedded = machine.state(state).map(|current| current.embedded.iter());
@@ -372,7 +373,12 @@ fn without_step(
 
 /// Whether a message that does not fit the state was sent before its sender had received the last
 /// messages of the other side, as a bid that arrives after the end of an auction. It changes nothing.
-fn has_crossed(machine: &Machine, party: &Party, state: u16, message: &PartyMessage<'_>) -> bool {
+fn has_crossed(
+    machine: &Machine,
+    party: &Party,
+    state: StateId,
+    message: &PartyMessage<'_>,
+) -> bool {
     if message.own || !message.answers {
         return false;
     }
@@ -400,7 +406,7 @@ fn has_crossed(machine: &Machine, party: &Party, state: u16, message: &PartyMess
 fn by_default(
     machine: &Machine,
     party: &Party,
-    state: u16,
+    state: StateId,
     message: &PartyMessage<'_>,
 ) -> Option<NextState> {
     if party.is_fresh() || !message.known {
@@ -488,7 +494,7 @@ fn is_repeated(party: &Party, message: &PartyMessage<'_>) -> bool {
     same_act && message.reply_with != 0 && party.asked[index] == message.reply_with
 }
 
-fn wrong(machine: &Machine, party: &Party, state: u16, message: &PartyMessage<'_>) -> Kind {
+fn wrong(machine: &Machine, party: &Party, state: StateId, message: &PartyMessage<'_>) -> Kind {
     if is_repeated(party, message) {
         return Kind::Repeated;
     }
@@ -505,7 +511,7 @@ fn wrong(machine: &Machine, party: &Party, state: u16, message: &PartyMessage<'_
     let mut reached = vec![false; machine.states.len()];
     let mut next = vec![state];
     while let Some(id) = next.pop() {
-        let fresh = reached.get_mut(usize::from(id)).filter(|seen| !**seen);
+        let fresh = reached.get_mut(id.index()).filter(|seen| !**seen);
         let Some((seen, later)) = fresh.zip(machine.state(id)) else {
             continue;
         };

@@ -9,6 +9,7 @@ use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
 use crate::conversation::party::Party;
 use crate::monitor::Monitor;
+use crate::protocol::index::MachineIndex;
 use crate::protocol::machine::{Machine, Scope, step};
 use crate::protocol::role::RoleSet;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
@@ -18,7 +19,7 @@ impl Monitor {
         &mut self,
         id: &str,
         parent: Option<SlotIndex>,
-        machine: u16,
+        machine: MachineIndex,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<Passed, Denied> {
@@ -76,7 +77,7 @@ impl Monitor {
         &mut self,
         id: &str,
         parent: Option<SlotIndex>,
-        machine: u16,
+        machine: MachineIndex,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<SlotIndex, Denied> {
@@ -108,7 +109,7 @@ impl Monitor {
     fn unopened(
         &mut self,
         id: &str,
-        machine: u16,
+        machine: MachineIndex,
         protocol: &Machine,
         observed: &ObservedMessage<'_>,
         now: Moment,

@@ -3,22 +3,23 @@
 use crate::conversation::Conversation;
 use crate::conversation::ids::SlotIndex;
 use crate::conversation::state::is_final;
+use crate::protocol::index::{MachineIndex, StateId};
 use crate::protocol::machine::Machine;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 
 /// The reason that a message was not accepted.
 pub(crate) enum Denied {
     Fault(Fault, SlotIndex),
-    NotOpened(u16),
+    NotOpened(MachineIndex),
     /// Refused without a conversation; with a similar protocol, if there is one.
-    Refused(Kind, Option<u16>),
+    Refused(Kind, Option<MachineIndex>),
     Unchecked(Unchecked),
 }
 
 /// The result of an accepted message.
 pub(crate) struct Passed {
-    pub(crate) machine: u16,
-    pub(crate) state: u16,
+    pub(crate) machine: MachineIndex,
+    pub(crate) state: StateId,
     pub(crate) opened: bool,
     pub(crate) complete: bool,
     pub(crate) late: bool,
@@ -29,7 +30,11 @@ pub(crate) struct Passed {
 impl Passed {
     /// The result of a message that changes nothing.
     #[inline]
-    pub(crate) fn in_state_of(conversation: &Conversation, machine: &Machine, index: u16) -> Self {
+    pub(crate) fn in_state_of(
+        conversation: &Conversation,
+        machine: &Machine,
+        index: MachineIndex,
+    ) -> Self {
         let parties = &conversation.parties;
         Self {
             machine: index,
@@ -48,7 +53,7 @@ impl Passed {
 #[derive(Debug, Clone)]
 pub(crate) struct Fault {
     pub(crate) kind: Kind,
-    pub(crate) state: Option<u16>,
+    pub(crate) state: Option<StateId>,
     pub(crate) participant: Option<String>,
 }
 

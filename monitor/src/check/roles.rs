@@ -16,6 +16,7 @@ use crate::conversation::rare::LastSent;
 use crate::conversation::state::AFTER_NOT_UNDERSTOOD;
 use crate::monitor::Monitor;
 use crate::protocol::act::{CANCEL, FAILURE, NOT_UNDERSTOOD};
+use crate::protocol::index::{MachineIndex, StateId};
 use crate::protocol::machine::Machine;
 use crate::protocol::projection::{LocalRun, NotLocal, Observed, Projection};
 use crate::protocol::role::{Role, RoleSet};
@@ -26,7 +27,7 @@ impl Monitor {
     pub(crate) fn open_local(
         &mut self,
         id: &str,
-        (index, machine): (u16, &Machine),
+        (index, machine): (MachineIndex, &Machine),
         projection: &Projection,
         observed: &ObservedMessage<'_>,
         now: Moment,
@@ -138,14 +139,17 @@ impl Monitor {
             Err(Denied::Fault(fault, at))
         };
         let Some(slot) = self.table.slot_mut(at) else {
-            return fault(Kind::NotOpened, 0);
+            return fault(Kind::NotOpened, StateId::FIRST);
         };
         let conversation = &mut slot.conversation;
         let index = conversation.machine;
         let Some(machine) = library.machine(index) else {
             return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
         };
-        let state = conversation.parties.first().map_or(0, |party| party.state);
+        let state = conversation
+            .parties
+            .first()
+            .map_or(StateId::FIRST, |party| party.state);
         if state == AFTER_NOT_UNDERSTOOD {
             // Other agents may not have received it yet.
             return match observed.own {

@@ -28,6 +28,7 @@ use crate::conversation::parties::Parties;
 use crate::conversation::party::Party;
 use crate::conversation::rare::Rare;
 use crate::limits::MAX_DESIGNATED;
+use crate::protocol::index::MachineIndex;
 use crate::protocol::role::Role;
 
 /// The order of the fields is that of the memory: see [`Slot`](crate::conversation::table::Slot).
@@ -35,7 +36,7 @@ use crate::protocol::role::Role;
 #[repr(C)]
 pub(crate) struct Conversation {
     /// Index into the library.
-    pub(crate) machine: u16,
+    pub(crate) machine: MachineIndex,
     /// Whether the conversation began between other agents, and the monitored agent joined it because
     /// a `reply-to` names it. It then has the place of the initiator.
     pub(crate) joined: bool,
@@ -57,7 +58,7 @@ impl Conversation {
     /// A conversation without agents, as an unused slot has it.
     pub(crate) fn unused() -> Self {
         Self {
-            machine: 0,
+            machine: MachineIndex::FIRST,
             joined: false,
             initiator: None,
             charged_texts: 0,
@@ -256,13 +257,14 @@ mod tests {
     use crate::conversation::party::{Details, EARLIER, Side, Worlds};
     use crate::conversation::rare::Copied;
     use crate::conversation::state::FAILED;
+    use crate::protocol::index::StateId;
     use crate::protocol::role::MessageRoles;
 
     #[test]
     fn what_parties_allocate_is_counted_and_one_buffer_is_kept() {
         let mut names = Names::new(std::hash::RandomState::new());
         let mut conversation = Conversation::unused();
-        let party = Party::new(None, 0);
+        let party = Party::new(None, StateId::FIRST);
         conversation.add(party.clone());
         assert_eq!(conversation.allocated(), 0);
         let [first] = &mut conversation.parties[..] else {
@@ -293,12 +295,12 @@ mod tests {
         conversation.clear();
         assert_eq!(conversation.allocated(), 0);
         // The buffer of a single party serves the next one.
-        let mut single = Party::new(None, 0);
+        let mut single = Party::new(None, StateId::FIRST);
         single.ask(Side::Other, 9, "r9");
         conversation.add(single);
         conversation.clear();
         assert_eq!(conversation.allocated(), size_of::<Details>());
-        conversation.add(Party::new(None, 0));
+        conversation.add(Party::new(None, StateId::FIRST));
         assert_eq!(conversation.allocated(), size_of::<Details>());
         let party = conversation.parties.first().unwrap();
         assert_eq!((party.asked_text(1), party.earlier(1)), ("", &[0; EARLIER]));
@@ -309,7 +311,7 @@ mod tests {
         let mut conversation = Conversation::unused();
         let fill = |conversation: &mut Conversation| {
             for agent in (0..20).map(Name::new) {
-                conversation.add(Party::new(Some(agent), 0));
+                conversation.add(Party::new(Some(agent), StateId::FIRST));
                 conversation.bound.push(RoleBinding {
                     role: Role::new(0),
                     agent,
@@ -321,7 +323,7 @@ mod tests {
             }
             // An uncertain one has two worlds.
             assert!(conversation.parties[0].take_back(Side::Initiator, 1, 7));
-            let mut unnamed = Party::new(None, 0);
+            let mut unnamed = Party::new(None, StateId::FIRST);
             unnamed.ask(Side::Initiator, 7, "r7");
             let rare = conversation.rare();
             rare.unnamed = Some(Box::new(unnamed));
@@ -329,7 +331,8 @@ mod tests {
             let delegate = |agent| (PartyIndex::new(0), Name::new(agent));
             rare.delegates.extend((0..5).map(delegate));
             let party = Some(PartyIndex::new(0));
-            rare.alternatives.extend((0..7).map(|state| (party, state)));
+            rare.alternatives
+                .extend((0..7).map(|state| (party, StateId::new(state))));
             let asked = |agent| RoleBinding {
                 role: Role::new(0),
                 agent,
@@ -365,7 +368,7 @@ mod tests {
         let bytes = added(&|rare| rare.delegates.reserve_exact(3));
         assert_eq!(bytes, 3 * size_of::<(PartyIndex, Name)>());
         let bytes = added(&|rare| rare.alternatives.reserve_exact(3));
-        assert_eq!(bytes, 3 * size_of::<(Option<PartyIndex>, u16)>());
+        assert_eq!(bytes, 3 * size_of::<(Option<PartyIndex>, StateId)>());
         let bytes = added(&|rare| rare.copied.reserve_exact(3));
         assert_eq!(bytes, 3 * size_of::<Copied>());
         for receivers in [3, 5] {
@@ -387,7 +390,7 @@ mod tests {
         let bytes = added(&|rare| rare.asked.grow(5));
         assert_eq!(bytes, 5 * size_of::<RoleBinding>());
         let bytes = added(&|rare| {
-            let mut party = Party::new(None, 0);
+            let mut party = Party::new(None, StateId::FIRST);
             party.ask(Side::Initiator, 7, "r7");
             rare.unnamed = Some(Box::new(party));
         });
@@ -410,7 +413,7 @@ mod tests {
                 let mut grow = |conversation: &mut Conversation, numbers: Range<usize>| {
                     for number in numbers {
                         let agent = names.acquire(&number.to_string());
-                        conversation.add(Party::new(Some(agent), 0));
+                        conversation.add(Party::new(Some(agent), StateId::FIRST));
                         conversation.bound.push(RoleBinding {
                             role: Role::new(0),
                             agent,
@@ -450,11 +453,11 @@ mod tests {
     fn a_party_is_found_among_few_and_many() {
         let mut names = Names::new(std::hash::RandomState::new());
         let mut table = table::Table::new(&std::hash::RandomState::new());
-        let at = table.insert("c", None, None, 0, 1);
+        let at = table.insert("c", None, None, MachineIndex::FIRST, 1);
         let conversation = &mut table.slot_mut(at).unwrap().conversation;
         for number in 0..40 {
             let peer = conversation.acquire(&mut names, &number.to_string());
-            conversation.add(Party::new(Some(peer), 0));
+            conversation.add(Party::new(Some(peer), StateId::FIRST));
             for known in 0..=number {
                 let found = conversation.party(&names, &known.to_string());
                 assert_eq!(found.map(|(at, _)| at), Some(known));

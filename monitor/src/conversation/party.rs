@@ -5,6 +5,7 @@ use fipa_acl::Performative;
 use crate::conversation::ids::Name;
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FAILED};
 use crate::protocol::act::{Act, CANCEL};
+use crate::protocol::index::StateId;
 
 /// The state of a conversation with one participant or with all of them. It fits into one cache line: see
 /// [`Slot`](crate::conversation::table::Slot).
@@ -13,11 +14,11 @@ use crate::protocol::act::{Act, CANCEL};
 pub(crate) struct Party {
     /// The participant, if each has a state of its own.
     pub(crate) peer: Option<Name>,
-    pub(crate) state: u16,
+    pub(crate) state: StateId,
     /// During a cancel, or after a failure or a not-understood: the state before it.
-    pub(crate) resume: u16,
+    pub(crate) resume: StateId,
     /// The state before the last message.
-    pub(crate) before: u16,
+    pub(crate) before: StateId,
     /// The side that sent the last message.
     pub(crate) last: Side,
     /// The side that canceled.
@@ -43,9 +44,9 @@ pub(crate) struct LastStep {
     side: Side,
     /// [`act_number`] of the message.
     act: u8,
-    state: u16,
-    resume: u16,
-    before: u16,
+    state: StateId,
+    resume: StateId,
+    before: StateId,
     last: Side,
     canceling_side: Side,
     echo: bool,
@@ -111,7 +112,7 @@ pub(crate) enum World {
 }
 
 impl Party {
-    pub(crate) fn new(peer: Option<Name>, state: u16) -> Self {
+    pub(crate) fn new(peer: Option<Name>, state: StateId) -> Self {
         Self {
             peer,
             state,
@@ -431,7 +432,7 @@ mod tests {
     fn a_message_that_is_taken_back_leaves_those_before_it() {
         // Up to more than there are earlier ones.
         for count in 0..=8 {
-            let mut party = Party::new(None, 0);
+            let mut party = Party::new(None, StateId::FIRST);
             for asked in 1..=count {
                 party.ask(Side::Initiator, asked, "");
             }

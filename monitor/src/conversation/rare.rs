@@ -6,6 +6,7 @@ use smallvec::SmallVec;
 use crate::conversation::bindings::RoleBinding;
 use crate::conversation::ids::{Name, PartyIndex};
 use crate::conversation::party::Party;
+use crate::protocol::index::StateId;
 use crate::protocol::projection::LocalRun;
 use crate::protocol::role::{MessageRoles, RoleSet};
 
@@ -24,7 +25,7 @@ pub(crate) struct Rare {
     /// If it may, other states to which the first message to a party may have led: the index of the
     /// party, or none for the members of a multicast, and the state. [`FAILED`] stands for any
     /// state: a message to the party was not delivered.
-    pub(crate) alternatives: Vec<(Option<PartyIndex>, u16)>,
+    pub(crate) alternatives: Vec<(Option<PartyIndex>, StateId)>,
     /// The conversation as the role of the monitored agent sees it.
     pub(crate) local: Option<LocalRun>,
     /// Whether an agent has a role in it that the monitored agent knows only from a message of that agent.
@@ -58,7 +59,7 @@ impl Rare {
             + self.reply_to.capacity() * size_of::<Name>()
             + unnamed.map_or(0, |party| size_of::<Party>() + party.allocated())
             + self.delegates.capacity() * size_of::<(PartyIndex, Name)>()
-            + self.alternatives.capacity() * size_of::<(Option<PartyIndex>, u16)>()
+            + self.alternatives.capacity() * size_of::<(Option<PartyIndex>, StateId)>()
             + self.copied.capacity() * size_of::<Copied>()
             + copies
                 .map(|copied| 8 * copied.seen.capacity())
@@ -79,7 +80,7 @@ pub(crate) struct LastSent {
     pub(crate) act: u8,
     pub(crate) reply_with: u64,
     /// The state before it.
-    pub(crate) state: u16,
+    pub(crate) state: StateId,
     /// Whether it is a `not-understood`, which the role does not see.
     pub(crate) ends: bool,
     /// Number of the role bindings before it.

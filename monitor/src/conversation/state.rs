@@ -1,24 +1,25 @@
 //! States of a party: those of its protocol, and those that are common to all protocols.
 
+use crate::protocol::index::StateId;
 use crate::protocol::machine::Machine;
 
 /// State of every protocol after `not-understood`.
-pub(crate) const AFTER_NOT_UNDERSTOOD: u16 = u16::MAX;
+pub(crate) const AFTER_NOT_UNDERSTOOD: StateId = StateId::common(0);
 
 /// State of every protocol after `cancel`, before the answer to it.
-pub(crate) const CANCELLING: u16 = u16::MAX - 1;
+pub(crate) const CANCELLING: StateId = StateId::common(1);
 
 /// State of every protocol after the answer `inform` to a `cancel`.
-pub(crate) const CANCELLED: u16 = u16::MAX - 2;
+pub(crate) const CANCELLED: StateId = StateId::common(2);
 
 /// State of every protocol after the message transport service reported a failure.
-pub(crate) const FAILED: u16 = u16::MAX - 3;
+pub(crate) const FAILED: StateId = StateId::common(3);
 
 /// State that the monitor does not know: see [`crate::check::delegated`].
-pub(crate) const ELSEWHERE: u16 = u16::MAX - 4;
+pub(crate) const ELSEWHERE: StateId = StateId::common(4);
 
 /// Returns the name of a state.
-pub(crate) fn state_name(machine: &Machine, state: u16) -> &str {
+pub(crate) fn state_name(machine: &Machine, state: StateId) -> &str {
     match state {
         AFTER_NOT_UNDERSTOOD => "not-understood",
         CANCELLING => "cancelling",
@@ -29,7 +30,7 @@ pub(crate) fn state_name(machine: &Machine, state: u16) -> &str {
     }
 }
 
-pub(crate) fn is_final(machine: &Machine, state: u16) -> bool {
+pub(crate) fn is_final(machine: &Machine, state: StateId) -> bool {
     match state {
         AFTER_NOT_UNDERSTOOD | CANCELLED | FAILED => true,
         CANCELLING => false,
@@ -38,7 +39,7 @@ pub(crate) fn is_final(machine: &Machine, state: u16) -> bool {
 }
 
 /// Whether no further message can follow.
-pub(crate) fn is_over(machine: &Machine, state: u16) -> bool {
+pub(crate) fn is_over(machine: &Machine, state: StateId) -> bool {
     match state {
         AFTER_NOT_UNDERSTOOD | CANCELLED | FAILED => true,
         CANCELLING => false,

@@ -12,6 +12,7 @@ use crate::conversation::Conversation;
 use crate::conversation::ids::{Name, SlotIndex};
 use crate::conversation::index::Index;
 use crate::conversation::names::spread;
+use crate::protocol::index::MachineIndex;
 
 /// A list of conversations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -354,7 +355,7 @@ impl Table {
         id: &str,
         parent: Option<SlotIndex>,
         peer: Option<Name>,
-        machine: u16,
+        machine: MachineIndex,
         now: u64,
     ) -> SlotIndex {
         let at = self.free_slot();
@@ -615,7 +616,8 @@ mod tests {
     #[test]
     fn conversations_are_listed_by_age_and_slots_are_reused() {
         let mut table = Table::new(&RandomState::new());
-        let [a, b, c] = ["a", "b", "c"].map(|id| table.insert(id, None, peer(7), 0, 1));
+        let [a, b, c] =
+            ["a", "b", "c"].map(|id| table.insert(id, None, peer(7), MachineIndex::FIRST, 1));
         assert_eq!(order(&table, List::Open), ["a", "b", "c"]);
         table.touch(a, List::Open, 2_000);
         assert_eq!(order(&table, List::Open), ["b", "c", "a"]);
@@ -633,7 +635,10 @@ mod tests {
         assert_eq!(order(&table, List::Open), ["b", "c"]);
         table.remove(b);
         assert_eq!((table.find("b"), table.find("c")), (None, Some(c)));
-        assert_eq!(table.insert("d", None, peer(7), 0, 6_000), b);
+        assert_eq!(
+            table.insert("d", None, peer(7), MachineIndex::FIRST, 6_000),
+            b
+        );
         assert_eq!(order(&table, List::Open), ["c", "d"]);
         assert_eq!(table.len(), 3);
     }
@@ -641,7 +646,7 @@ mod tests {
     #[test]
     fn a_conversation_moves_in_its_list_at_most_once_a_second() {
         let mut table = Table::new(&RandomState::new());
-        let [a, _] = ["a", "b"].map(|id| table.insert(id, None, peer(7), 0, 1));
+        let [a, _] = ["a", "b"].map(|id| table.insert(id, None, peer(7), MachineIndex::FIRST, 1));
         for now in [400, 800, 1_000] {
             table.touch(a, List::Open, now);
             assert_eq!(order(&table, List::Open), ["a", "b"], "{now}");
@@ -660,10 +665,10 @@ mod tests {
     #[test]
     fn each_peer_has_a_list_and_is_charged() {
         let mut table = Table::new(&RandomState::new());
-        let a = table.insert("a", None, peer(1), 0, 1);
-        let b = table.insert("b", None, peer(2), 0, 2);
-        let c = table.insert("a", None, peer(1), 0, 3);
-        let child = table.insert("a", Some(c), peer(1), 0, 3);
+        let a = table.insert("a", None, peer(1), MachineIndex::FIRST, 1);
+        let b = table.insert("b", None, peer(2), MachineIndex::FIRST, 2);
+        let c = table.insert("a", None, peer(1), MachineIndex::FIRST, 3);
+        let child = table.insert("a", Some(c), peer(1), MachineIndex::FIRST, 3);
         assert_eq!(table.find_all("a").count(), 2);
         assert_eq!(table.oldest_of(peer(1), List::Open), Some(a));
         assert_eq!(table.oldest_of(peer(2), List::Open), Some(b));
@@ -704,7 +709,7 @@ mod tests {
     fn buffers_of_long_ids_are_not_kept() {
         for (len, is_reused) in [(100, true), (128, true), (129, false), (1_000, false)] {
             let mut table = Table::new(&RandomState::new());
-            let at = table.insert(&"x".repeat(len), None, peer(7), 0, 1);
+            let at = table.insert(&"x".repeat(len), None, peer(7), MachineIndex::FIRST, 1);
             table.remove(at);
             let capacity = table.cold[at.get()].id.capacity();
             assert_eq!(capacity >= len, is_reused, "{len}: {capacity}");
@@ -724,7 +729,7 @@ mod tests {
         let mut table = Table::new(&RandomState::new());
         let ids: Vec<String> = (0..3 * CHUNK).map(|number| number.to_string()).collect();
         for (at, id) in (0..).map(SlotIndex::new).zip(&ids) {
-            assert_eq!(table.insert(id, None, peer(7), 0, 1), at);
+            assert_eq!(table.insert(id, None, peer(7), MachineIndex::FIRST, 1), at);
         }
         for (at, id) in (0..).map(SlotIndex::new).zip(&ids) {
             assert_eq!(table.id(at), id);
@@ -737,8 +742,9 @@ mod tests {
     #[test]
     fn embedded_conversations_are_linked_to_their_parent() {
         let mut table = Table::new(&RandomState::new());
-        let main = table.insert("main", None, peer(7), 0, 1);
-        let children = [0; 3].map(|_| table.insert("main", Some(main), peer(7), 1, 1));
+        let main = table.insert("main", None, peer(7), MachineIndex::FIRST, 1);
+        let children =
+            [0; 3].map(|_| table.insert("main", Some(main), peer(7), MachineIndex::new(1), 1));
         let chain = |table: &Table| {
             let mut found = Vec::new();
             let mut at = table.slot(main).unwrap().child;

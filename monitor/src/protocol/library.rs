@@ -1,6 +1,7 @@
 //! Libraries of protocols by name.
 
 use crate::Machine;
+use crate::protocol::index::MachineIndex;
 use crate::protocol::scxml::ScxmlError;
 use crate::protocol::spelling::one_edit_apart;
 
@@ -123,14 +124,14 @@ impl Library {
         self.machines.iter()
     }
 
-    pub(crate) fn index_of(&self, name: &str) -> Option<u16> {
+    pub(crate) fn index_of(&self, name: &str) -> Option<MachineIndex> {
         let named = |machine: &Machine| machine.name().eq_ignore_ascii_case(name);
         let mut machines = self.machines.iter();
         let found = machines.position(named).or_else(|| {
             let mut machines = self.machines.iter();
             machines.position(|machine| machine.is_called(name))
         });
-        found.and_then(|index| u16::try_from(index).ok())
+        found.map(MachineIndex::new)
     }
 
     /// Finds the protocol, among those that `is_meant` admits, from whose name or alias this one differs
@@ -139,7 +140,7 @@ impl Library {
         &self,
         name: &str,
         is_meant: impl Fn(&Machine) -> bool,
-    ) -> Option<u16> {
+    ) -> Option<MachineIndex> {
         /// Maximum length of a name that is compared with the known ones.
         const MAX_COMPARED: usize = 128;
         if name.len() > MAX_COMPARED {
@@ -151,12 +152,12 @@ impl Library {
             let mut aliases = machine.aliases().iter();
             is_meant(machine) && (is_near(machine.name()) || aliases.any(|alias| is_near(alias)))
         });
-        found.and_then(|index| u16::try_from(index).ok())
+        found.map(MachineIndex::new)
     }
 
     #[inline]
-    pub(crate) fn machine(&self, index: u16) -> Option<&Machine> {
-        self.machines.get(usize::from(index))
+    pub(crate) fn machine(&self, index: MachineIndex) -> Option<&Machine> {
+        self.machines.get(index.index())
     }
 }
 

@@ -1,11 +1,13 @@
 //! Protocols as checked state machines. [`crate::protocol::scxml`] reads them.
 
+use std::num::NonZeroU16;
 use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::Pattern;
 
 use crate::protocol::act::{Act, Acts, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+use crate::protocol::index::StateId;
 use crate::protocol::projection::Projection;
 use crate::protocol::role::{Role, RoleSet};
 
@@ -30,7 +32,7 @@ pub struct Machine {
     pub(crate) roles: Vec<String>,
     /// Index of the initiating role.
     pub(crate) initiator: Role,
-    pub(crate) initial: u16,
+    pub(crate) initial: StateId,
     pub(crate) states: Vec<State>,
     /// The protocol as each role sees it, if it has three or more roles and can be projected.
     pub(crate) projection: Option<Arc<Projection>>,
@@ -78,7 +80,7 @@ pub struct Transition {
     pub(crate) acts: Acts,
     pub(crate) from: Roles,
     pub(crate) to: Roles,
-    pub(crate) target: u16,
+    pub(crate) target: StateId,
     pub(crate) optional: bool,
     pub(crate) guard: Guard,
 }
@@ -86,8 +88,8 @@ pub struct Transition {
 /// The conditions of a transition about the other participants. There are none by default.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Guard {
-    /// Maximum number of participants in the target state; 0 for any number.
-    pub(crate) at_most: u16,
+    /// Maximum number of participants in the target state; none for any number.
+    pub(crate) at_most: Option<NonZeroU16>,
     /// Whether all participants must be in a state with the same transition, or in its target.
     pub(crate) when_all: bool,
 }
@@ -105,7 +107,7 @@ pub struct Subprotocol {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Timeout {
     pub(crate) after: After,
-    pub(crate) target: u16,
+    pub(crate) target: StateId,
 }
 
 /// The time of a timeout.
@@ -231,18 +233,21 @@ impl Machine {
             let proxied = state.embedded.iter().any(|sub| sub.proxied_to.is_some());
             proxied || state.steps.iter().any(|step| step.acts.contains(act))
         };
-        let later = (0_u16..).zip(&self.states).any(|(at, state)| {
-            // The transitions of the initial state follow only if another state leads back to it.
-            (at != self.initial || self.returns()) && contains(state)
-        });
+        let later = (0..)
+            .map(StateId::new)
+            .zip(&self.states)
+            .any(|(at, state)| {
+                // The transitions of the initial state follow only if another state leads back to it.
+                (at != self.initial || self.returns()) && contains(state)
+            });
         let cancels = act == CANCEL && self.cancel != Cancel::Nobody;
         later || cancels || [NOT_UNDERSTOOD, FAILURE, INFORM].contains(&act)
     }
 
     /// The states to which a message that looks like the first one leads later: see [`step`].
-    pub(crate) fn later_targets(&self, act: Act<'_>, first: &Transition) -> Vec<u16> {
+    pub(crate) fn later_targets(&self, act: Act<'_>, first: &Transition) -> Vec<StateId> {
         let later = self.later_steps(act, first).map(|step| step.target);
-        let mut targets: Vec<u16> = later.filter(|target| *target != first.target).collect();
+        let mut targets: Vec<StateId> = later.filter(|target| *target != first.target).collect();
         targets.sort_unstable();
         targets.dedup();
         targets
@@ -259,7 +264,7 @@ impl Machine {
         act: Act<'m>,
         first: &'m Transition,
     ) -> impl Iterator<Item = &'m Transition> {
-        let later = (0_u16..).zip(&self.states);
+        let later = (0..).map(StateId::new).zip(&self.states);
         let later = later.filter(|(at, _)| *at != self.initial || self.returns());
         later
             .flat_map(|(_, state)| &state.transitions)
@@ -286,8 +291,8 @@ impl Machine {
     }
 
     #[inline]
-    pub(crate) fn state(&self, id: u16) -> Option<&State> {
-        self.states.get(usize::from(id))
+    pub(crate) fn state(&self, id: StateId) -> Option<&State> {
+        self.states.get(id.index())
     }
 }
 
@@ -356,7 +361,7 @@ impl Transition {
     /// The maximum number of participants that may be in the target state at the same time.
     #[must_use]
     pub fn at_most(&self) -> Option<u16> {
-        Some(self.guard.at_most).filter(|most| *most > 0)
+        self.guard.at_most.map(NonZeroU16::get)
     }
 
     /// Whether the transition needs all participants: each is in a state with the same transition, or

@@ -3,6 +3,7 @@
 //! Conversations and messages do not belong here.
 
 pub(crate) mod act;
+pub(crate) mod index;
 pub(crate) mod library;
 pub(crate) mod machine;
 pub mod projection;

@@ -2,6 +2,7 @@
 
 use std::collections::{HashSet, VecDeque};
 
+use super::local::LocalIndex;
 use super::{Defect, Local, LocalState, Performed, Projection};
 use crate::protocol::machine::Machine;
 
@@ -15,7 +16,7 @@ const MAX_DEFECTS: usize = 8;
 /// The states of all roles, and the messages under way from each role to each other one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Configuration {
-    states: Vec<u16>,
+    states: Vec<LocalIndex>,
     queues: Vec<VecDeque<Performed>>,
 }
 
@@ -23,7 +24,7 @@ pub(super) fn explore(projection: &Projection, machine: &Machine) -> Vec<Defect>
     let locals = &projection.locals;
     let roles = locals.len();
     let first = Configuration {
-        states: vec![0; roles],
+        states: vec![LocalIndex::FIRST; roles],
         queues: vec![VecDeque::new(); roles * roles],
     };
     let mut known = HashSet::from([first.clone()]);
@@ -101,7 +102,7 @@ impl Configuration {
 
     /// The defects of a configuration in which no role can go on.
     fn stuck(&self, locals: &[Local], machine: &Machine) -> Vec<Defect> {
-        let shown = |local: &Local, state: u16| {
+        let shown = |local: &Local, state: LocalIndex| {
             let state = local.state(state);
             state.map_or_else(String::new, |state| state.names().join("|"))
         };

@@ -2,6 +2,7 @@
 
 use super::{Label, Performed};
 use crate::protocol::act::Act;
+use crate::protocol::index::StateId;
 use crate::protocol::machine::Machine;
 use crate::protocol::role::{Role, RoleSet};
 
@@ -19,15 +20,33 @@ pub struct Local {
 pub struct LocalState {
     names: Vec<String>,
     pub(super) is_final: bool,
-    globals: Vec<u16>,
+    globals: Vec<StateId>,
     pub(super) steps: Vec<LocalStep>,
+}
+
+/// Index of a state in [`Local::states`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(transparent)]
+pub(super) struct LocalIndex(u16);
+
+impl LocalIndex {
+    pub(super) const FIRST: Self = Self(0);
+
+    /// Saturates above the maximum number of states of a projection.
+    pub(super) fn new(index: usize) -> Self {
+        Self(u16::try_from(index).unwrap_or(u16::MAX))
+    }
+
+    fn index(self) -> usize {
+        usize::from(self.0)
+    }
 }
 
 /// A message that the role sends or receives.
 #[derive(Debug, Clone)]
 pub struct LocalStep {
     pub(super) label: Label,
-    pub(super) target: u16,
+    pub(super) target: LocalIndex,
 }
 
 impl Local {
@@ -60,13 +79,13 @@ impl Local {
         role.map_or("", String::as_str)
     }
 
-    pub(super) fn state(&self, at: u16) -> Option<&LocalState> {
-        self.states.get(usize::from(at))
+    pub(super) fn state(&self, at: LocalIndex) -> Option<&LocalState> {
+        self.states.get(at.index())
     }
 }
 
 impl LocalState {
-    pub(super) fn of(machine: &Machine, states: impl Iterator<Item = u16> + Clone) -> Self {
+    pub(super) fn of(machine: &Machine, states: impl Iterator<Item = StateId> + Clone) -> Self {
         let all = || {
             states
                 .clone()
@@ -100,8 +119,8 @@ impl LocalState {
 
     /// A state of the protocol that stands for these. The monitor removes a conversation whose state
     /// is over, so this is such a state only if the role has nothing more to do.
-    pub(crate) fn global_in(&self, machine: &Machine) -> u16 {
-        let over = |at: &u16| machine.state(*at).is_some_and(|state| state.is_over());
+    pub(crate) fn global_in(&self, machine: &Machine) -> StateId {
+        let over = |at: &StateId| machine.state(*at).is_some_and(|state| state.is_over());
         let mut all = self.globals.iter().copied();
         let wanted = all.clone().find(|at| over(at) == self.is_over());
         wanted.or_else(|| all.next()).unwrap_or(machine.initial)
@@ -123,7 +142,7 @@ impl LocalStep {
     /// Index of the state after the message.
     #[must_use]
     pub fn target(&self) -> usize {
-        usize::from(self.target)
+        self.target.index()
     }
 }
 
@@ -159,7 +178,7 @@ pub(crate) struct LocalRun {
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Part {
     role: Role,
-    state: u16,
+    state: LocalIndex,
     /// Messages that came before their turn, because messages of other senders are under way.
     early: Vec<(Role, Performed)>,
 }
@@ -175,7 +194,7 @@ impl LocalRun {
         let parts = locals.iter().filter(|local| roles.contains(local.role));
         let part = |local: &Local| Part {
             role: local.role,
-            state: 0,
+            state: LocalIndex::FIRST,
             early: Vec::new(),
         };
         Self {
@@ -335,7 +354,7 @@ impl Part {
         }
     }
 
-    fn next_early(&self, local: &Local) -> Option<(usize, u16)> {
+    fn next_early(&self, local: &Local) -> Option<(usize, LocalIndex)> {
         let state = local.state(self.state)?;
         let mut early = self.early.iter().enumerate();
         early.find_map(|(at, (from, act))| {

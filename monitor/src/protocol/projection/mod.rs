@@ -37,10 +37,12 @@ mod local;
 
 use std::collections::{BTreeSet, HashMap};
 
+use local::LocalIndex;
+
 use crate::protocol::act::{Act, Acts};
+use crate::protocol::index::StateId;
 use crate::protocol::machine::{Machine, Roles, Scope, State, Transition};
 use crate::protocol::role::{Role, RoleSet};
-
 pub use local::{Local, LocalState, LocalStep};
 pub(crate) use local::{LocalRun, NotLocal, Observed};
 
@@ -164,7 +166,7 @@ impl Performed {
 }
 
 /// The transitions of each global state, with single roles and performatives.
-type Steps = Vec<Vec<(Label, u16)>>;
+type Steps = Vec<Vec<(Label, StateId)>>;
 
 impl Projection {
     /// Projects a protocol onto its roles.
@@ -292,8 +294,8 @@ fn performed(acts: &Acts) -> Option<Vec<Performed>> {
 
 /// Finds the states in which several roles decide.
 fn mixed_choices(machine: &Machine, steps: &Steps, defects: &mut Vec<Defect>) {
-    let after = |state: u16, label: &Label| {
-        let steps = steps.get(usize::from(state))?;
+    let after = |state: StateId, label: &Label| {
+        let steps = steps.get(state.index())?;
         let found = steps.iter().find(|(known, _)| known == label);
         found.map(|(_, target)| *target)
     };
@@ -324,18 +326,18 @@ pub(crate) fn role_name(machine: &Machine, role: Role) -> &str {
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 struct Unseen {
     /// The states that messages lead to.
-    by_messages: BTreeSet<u16>,
+    by_messages: BTreeSet<StateId>,
     /// The states that timeouts lead to.
-    by_timeouts: BTreeSet<u16>,
+    by_timeouts: BTreeSet<StateId>,
 }
 
 impl Unseen {
     /// Adds all states that messages between other roles, and timeouts, lead to.
-    fn closed(machine: &Machine, steps: &Steps, role: Role, from: BTreeSet<u16>) -> Self {
-        let hidden = |all: &mut BTreeSet<u16>| {
-            let mut next: Vec<u16> = all.iter().copied().collect();
+    fn closed(machine: &Machine, steps: &Steps, role: Role, from: BTreeSet<StateId>) -> Self {
+        let hidden = |all: &mut BTreeSet<StateId>| {
+            let mut next: Vec<StateId> = all.iter().copied().collect();
             while let Some(state) = next.pop() {
-                let steps = steps.get(usize::from(state));
+                let steps = steps.get(state.index());
                 for (label, target) in steps.into_iter().flatten() {
                     if label.from != role && label.to != role && all.insert(*target) {
                         next.push(*target);
@@ -352,7 +354,7 @@ impl Unseen {
                 .union(&by_timeouts)
                 .filter_map(|state| machine.state(*state));
             let targets = all.filter_map(|state| Some(state.timeout?.target));
-            let targets: Vec<u16> = targets.collect();
+            let targets: Vec<StateId> = targets.collect();
             by_timeouts.extend(targets);
             hidden(&mut by_timeouts);
             by_timeouts.retain(|state| !by_messages.contains(state));
@@ -365,7 +367,7 @@ impl Unseen {
         }
     }
 
-    fn all(&self) -> impl Iterator<Item = u16> + Clone {
+    fn all(&self) -> impl Iterator<Item = StateId> + Clone {
         self.by_messages.union(&self.by_timeouts).copied()
     }
 }
@@ -378,14 +380,14 @@ fn project(
     defects: &mut Vec<Defect>,
 ) -> Option<Local> {
     let first = Unseen::closed(machine, steps, role, BTreeSet::from([machine.initial]));
-    let mut numbers = HashMap::from([(first.clone(), 0_u16)]);
+    let mut numbers = HashMap::from([(first.clone(), LocalIndex::FIRST)]);
     let mut sets = vec![first];
     let mut states: Vec<LocalState> = Vec::new();
     while let Some(set) = sets.get(states.len()).cloned() {
         not_told(machine, steps, role, &set, defects);
-        let mut targets: Vec<(Label, BTreeSet<u16>)> = Vec::new();
+        let mut targets: Vec<(Label, BTreeSet<StateId>)> = Vec::new();
         for state in set.all() {
-            for (label, target) in steps.get(usize::from(state)).into_iter().flatten() {
+            for (label, target) in steps.get(state.index()).into_iter().flatten() {
                 if label.from != role && label.to != role {
                     continue;
                 }
@@ -400,7 +402,7 @@ fn project(
         let mut local = LocalState::of(machine, set.all());
         for (label, target) in targets {
             let target = Unseen::closed(machine, steps, role, target);
-            let next = u16::try_from(sets.len()).unwrap_or(u16::MAX);
+            let next = LocalIndex::new(sets.len());
             let number = *numbers.entry(target.clone()).or_insert(next);
             if number == next {
                 sets.push(target);
@@ -427,13 +429,13 @@ fn project(
 
 /// Finds the messages that a role may send in one of these states and not in another.
 fn not_told(machine: &Machine, steps: &Steps, role: Role, set: &Unseen, defects: &mut Vec<Defect>) {
-    let sends = |state: u16, label: &Label| {
-        let steps = steps.get(usize::from(state)).into_iter().flatten();
+    let sends = |state: StateId, label: &Label| {
+        let steps = steps.get(state.index()).into_iter().flatten();
         steps.clone().any(|(known, _)| known == label)
     };
     let mut known: Vec<&Label> = Vec::new();
     for state in &set.by_messages {
-        for (label, _) in steps.get(usize::from(*state)).into_iter().flatten() {
+        for (label, _) in steps.get(state.index()).into_iter().flatten() {
             if label.from != role || known.contains(&label) {
                 continue;
             }

@@ -9,6 +9,7 @@ use fipa_acl::{Pattern, PatternError};
 use super::document::{self, Document};
 use super::{Ambiguity, Doubt, MAX_MISTAKES, Mistake, Problem, Warning};
 use crate::protocol::act::{Acts, is_word, near_standard};
+use crate::protocol::index::StateId;
 use crate::protocol::machine::{
     After, Cancel, Guard, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
 };
@@ -45,7 +46,7 @@ struct Builder<'d> {
     mistakes: Vec<Mistake>,
     warnings: Vec<Warning>,
     roles: Vec<String>,
-    ids: HashMap<&'d str, u16>,
+    ids: HashMap<&'d str, StateId>,
     /// Compiled patterns. Most files repeat the same few.
     known_acts: HashMap<&'d str, Acts>,
     known_roles: HashMap<&'d str, Roles>,
@@ -107,9 +108,9 @@ impl<'d> Builder<'d> {
     }
 
     fn name_states(&mut self) {
-        for (index, state) in (0_u16..).zip(&self.document.states) {
+        for (index, state) in (0..).map(StateId::new).zip(&self.document.states) {
             if let Some(first) = self.ids.get(state.id.as_str()) {
-                let first = self.document.states.get(usize::from(*first));
+                let first = self.document.states.get(first.index());
                 let problem = Problem::DuplicateState {
                     id: state.id.clone(),
                     first: first.map_or(0, |state| state.line),
@@ -214,9 +215,9 @@ impl<'d> Builder<'d> {
     fn guard(&mut self, read: &'d document::Transition) -> Guard {
         let mut guard = Guard::default();
         if let Some(text) = &read.at_most {
-            match text.parse::<u16>() {
-                Ok(most @ 1..) => guard.at_most = most,
-                _ => self.value(read.line, "at-most", text, "a number from 1 to 65535"),
+            match text.parse() {
+                Ok(most) => guard.at_most = Some(most),
+                Err(_) => self.value(read.line, "at-most", text, "a number from 1 to 65535"),
             }
         }
         match read.when.as_deref() {
@@ -356,7 +357,7 @@ impl<'d> Builder<'d> {
                 steps.extend(state.transitions.iter().cloned());
                 embedded.extend(state.subprotocols.iter().cloned());
                 for transition in state.transitions.iter().filter(|step| step.optional) {
-                    let target = usize::from(transition.target);
+                    let target = transition.target.index();
                     if target == index {
                         let id = state.id.clone();
                         self.wrong(self.line_of(index), Problem::OptionalCircle(id));
@@ -386,7 +387,7 @@ impl<'d> Builder<'d> {
         while let Some(id) = next.pop() {
             let Some((state, seen)) = machine
                 .state(id)
-                .zip(reached.get_mut(usize::from(id)))
+                .zip(reached.get_mut(id.index()))
                 .filter(|(_, seen)| !**seen)
             else {
                 continue;
@@ -440,7 +441,7 @@ impl<'d> Builder<'d> {
     }
 
     fn beginner(&mut self, machine: &Machine) -> Option<Role> {
-        let line = self.line_of(usize::from(machine.initial));
+        let line = self.line_of(machine.initial.index());
         let initial = machine.state(machine.initial)?;
         let mask = initial
             .steps
@@ -501,7 +502,7 @@ impl<'d> Builder<'d> {
         }
     }
 
-    fn state(&mut self, line: usize, id: &str) -> Option<u16> {
+    fn state(&mut self, line: usize, id: &str) -> Option<StateId> {
         let known = self.ids.get(id).copied();
         if known.is_none() {
             let alike = |known: &&&str| known.eq_ignore_ascii_case(id) || one_edit_apart(known, id);
