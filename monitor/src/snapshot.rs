@@ -34,7 +34,7 @@ use crate::conversation::party::{EARLIER, Party, Side, Tail};
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FAILED};
 use crate::limits::{MAX_ALIKE, MAX_DESIGNATED, MAX_TEXT};
 use crate::monitor::Monitor;
-use crate::protocol::act::Act;
+use crate::protocol::act::ActNumber;
 use crate::protocol::index::{MachineIndex, StateId};
 use crate::protocol::machine::{Machine, Scope};
 use crate::protocol::role::Role;
@@ -329,7 +329,7 @@ fn write_party(
             | flag(party.canceling_side == Side::Other, CANCELED_BY_OTHER)
             | flag(party.echo, ECHO),
     );
-    out.extend_from_slice(&party.acts);
+    out.extend(party.acts.map(|act| act.map_or(0, ActNumber::byte)));
     for (side, asked) in party.asked.iter().enumerate() {
         out.extend_from_slice(&asked.to_le_bytes());
         put_text(out, party.asked_text(side))?;
@@ -623,9 +623,12 @@ impl<'s> Input<'s> {
             true => Side::Initiator,
             false => Side::Other,
         };
-        let acts: [u8; 2] = self.array()?;
-        if !acts.iter().all(|act| Act::is_number(*act)) {
-            return malformed("an unknown performative");
+        let mut acts = [None; 2];
+        for (act, byte) in acts.iter_mut().zip(self.array::<2>()?) {
+            *act = ActNumber::from_byte(byte);
+            if act.is_none() && byte != 0 {
+                return malformed("an unknown performative");
+            }
         }
         let mut party = Party {
             resume,

@@ -69,7 +69,7 @@ impl PartiesBefore {
         let mut parties = conversation.parties.iter();
         // With one state for all participants, the party exists before the first message.
         let is_new =
-            machine.scope == Scope::Conversation && parties.all(|party| party.acts == [0; 2]);
+            machine.scope == Scope::Conversation && parties.all(|party| party.acts == [None; 2]);
         Self {
             count: if is_new {
                 0

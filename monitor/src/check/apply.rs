@@ -11,8 +11,9 @@ use crate::conversation::bindings::RoleBinding;
 use crate::conversation::deadlines::{Deadline, Deadlines};
 use crate::conversation::ids::PartyIndex;
 use crate::conversation::names::Names;
-use crate::conversation::party::{Party, Side, act_number, side_index};
+use crate::conversation::party::{Party, Side, side_index};
 use crate::conversation::state::{CANCELLING, FAILED};
+use crate::protocol::act::ActNumber;
 use crate::protocol::index::StateId;
 use crate::protocol::machine::{After, Machine, Scope};
 use crate::protocol::role::{MessageRoles, Role, RoleSet};
@@ -122,7 +123,7 @@ impl Change<'_> {
         };
         self.opened |= party_move.target.is_new();
         if let Some(party) = conversation.parties.get_mut(index) {
-            self.opened |= party.acts == [0; 2] && !party_move.reported;
+            self.opened |= party.acts == [None; 2] && !party_move.reported;
             self.move_party(party, party_move);
             if party.deadline != 0 {
                 self.deadlines.push(Deadline {
@@ -165,7 +166,7 @@ impl Change<'_> {
         }
         party.begin_step(
             side,
-            act_number(self.observed.act),
+            ActNumber::of(self.observed.act),
             self.observed.reply_with,
             cancels,
         );
@@ -175,7 +176,7 @@ impl Change<'_> {
             party.set_cancel(self.observed.reply_with);
         } else if !next_state.answers_cancel {
             let index = side_index(side);
-            party.acts[index] = act_number(self.observed.act);
+            party.acts[index] = Some(ActNumber::of(self.observed.act));
             party.ask(
                 side,
                 self.observed.reply_with,

@@ -20,10 +20,10 @@ use crate::check::observed::ObservedMessage;
 use crate::check::outcome::Denied;
 use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
-use crate::conversation::party::{Party, Side, act_number, side_index};
+use crate::conversation::party::{Party, Side, side_index};
 use crate::conversation::state::ELSEWHERE;
 use crate::monitor::Monitor;
-use crate::protocol::act::{Act, FAILURE, INFORM};
+use crate::protocol::act::{Act, ActNumber, FAILURE, INFORM};
 use crate::protocol::index::{MachineIndex, StateId};
 use crate::protocol::machine::{Cancel, Machine, Scope, step};
 use crate::protocol::role::RoleSet;
@@ -165,7 +165,7 @@ impl Monitor {
             None => Some(conversation.acquire(&mut self.names, observed.sender)),
         };
         let mut party = Party::new(peer, state);
-        party.acts[side_index(Side::Other)] = act_number(observed.act);
+        party.acts[side_index(Side::Other)] = Some(ActNumber::of(observed.act));
         party.ask(Side::Other, observed.reply_with, observed.reply_with_text);
         match known.and_then(|known| conversation.parties.get_mut(known)) {
             Some(known) => *known = party,

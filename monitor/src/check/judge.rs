@@ -202,7 +202,7 @@ impl Judge<'_> {
             && self.machine.state(next_state.state).is_some()
             && !next_state.void
             && !next_state.answers_cancel
-            && party.acts[side_index(Side::Initiator)] == 0
+            && party.acts[side_index(Side::Initiator)].is_none()
     }
 
     /// Handles the report of a message transport service: a message of the receiver was not delivered to

@@ -288,20 +288,19 @@ impl Monitor {
             state: None,
         };
         let passed = change.apply(&mut slot.conversation, &self.moves, copy);
-        self.settle(at, &passed, now.millis());
+        let is_charged = slot.is_charged();
+        // An embedded conversation is in no list, and one that is not complete is not over.
+        let is_listed =
+            slot.parent.is_some() || !passed.complete && slot.touch(List::Open, now.millis());
+        self.settle(at, is_listed, is_charged, now.millis());
         Ok(passed)
     }
 
-    /// Updates the time, the place and the charge of a conversation after an accepted message.
+    /// Updates the place of a conversation in the lists, if it is not `is_listed` there yet, and the bytes with
+    /// which its peer is charged.
     #[inline]
-    fn settle(&mut self, at: SlotIndex, passed: &Passed, now: u64) {
-        let Some(slot) = self.table.slot_mut(at) else {
-            return;
-        };
-        let is_charged = slot.is_charged();
-        // An embedded conversation is in no list, and one that is not complete is not over.
-        let is_main = slot.parent.is_none();
-        if is_main && (passed.complete || !slot.touch(List::Open, now)) {
+    fn settle(&mut self, at: SlotIndex, is_listed: bool, is_charged: bool, now: u64) {
+        if !is_listed {
             self.touch(at, now);
         }
         if !is_charged {

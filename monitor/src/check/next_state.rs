@@ -3,11 +3,9 @@
 //!
 //! This module does not change the party.
 
-use crate::conversation::party::{
-    EARLIER, Party, Side, World, Worlds, act_number, short, side_index, standard_act,
-};
+use crate::conversation::party::{EARLIER, Party, Side, World, Worlds, short, side_index};
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FAILED};
-use crate::protocol::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
+use crate::protocol::act::{Act, ActNumber, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::protocol::index::StateId;
 use crate::protocol::machine::{Cancel, Guard, Machine, Roles, Scope, State, Transition, step};
 use crate::protocol::role::{MessageRoles, RoleSet};
@@ -420,7 +418,8 @@ fn by_default(
     match message.act {
         NOT_UNDERSTOOD => {
             // It may have crossed the message that ended the protocol, if others can still follow.
-            let ended_by = standard_act(party.acts[side_index(message.side.opposite())]);
+            let ended_by = party.acts[side_index(message.side.opposite())];
+            let ended_by = ended_by.and_then(ActNumber::standard);
             let ends = |step: &Transition| {
                 step.target == state
                     && step.from.includes(message.to)
@@ -490,7 +489,7 @@ fn in_reply(party: &Party, message: &PartyMessage<'_>) -> Result<Reply, Kind> {
 
 fn is_repeated(party: &Party, message: &PartyMessage<'_>) -> bool {
     let index = side_index(message.side);
-    let same_act = act_number(message.act) != 0 && party.acts[index] == act_number(message.act);
+    let same_act = party.acts[index] == Some(ActNumber::of(message.act));
     same_act && message.reply_with != 0 && party.asked[index] == message.reply_with
 }
 

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::time::SystemTime;
 
-use crate::protocol::act::Act;
+use crate::protocol::act::{Act, ActNumber};
 
 /// A message with the values that every check of it needs.
 pub(crate) struct ObservedMessage<'a> {
@@ -29,4 +29,13 @@ pub(crate) struct ObservedMessage<'a> {
     pub(crate) undelivered_to: Option<&'a str>,
     /// Index of the monitored agent in the receivers, if another agent is the sender.
     pub(crate) own_receiver: Option<usize>,
+}
+
+/// A message that was accepted before, and was not delivered to one receiver.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SentMessage<'a> {
+    pub(crate) sender: &'a str,
+    pub(crate) receiver: &'a str,
+    pub(crate) act: ActNumber,
+    pub(crate) reply_with: u64,
 }

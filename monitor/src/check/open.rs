@@ -31,8 +31,7 @@ impl Monitor {
         if parent.is_none()
             && let Some(projection) = protocol.projection.clone().filter(|_| self.agent.is_some())
         {
-            let machine = (machine, protocol);
-            return self.open_local(id, machine, &projection, observed, now);
+            return self.open_local(id, machine, protocol, &projection, observed, now);
         }
         let begins = step(
             &protocol.initial().steps,

@@ -5,17 +5,17 @@ use std::sync::Arc;
 
 use crate::Moment;
 use crate::check::judge::unbound;
-use crate::check::observed::ObservedMessage;
+use crate::check::observed::{ObservedMessage, SentMessage};
 use crate::check::outcome::{Denied, Fault, Passed};
 use crate::conversation::Conversation;
 use crate::conversation::bindings::RoleBinding;
 use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
-use crate::conversation::party::{Party, act_number};
+use crate::conversation::party::Party;
 use crate::conversation::rare::LastSent;
 use crate::conversation::state::AFTER_NOT_UNDERSTOOD;
 use crate::monitor::Monitor;
-use crate::protocol::act::{CANCEL, FAILURE, NOT_UNDERSTOOD};
+use crate::protocol::act::{ActNumber, CANCEL, FAILURE, NOT_UNDERSTOOD};
 use crate::protocol::index::{MachineIndex, StateId};
 use crate::protocol::machine::Machine;
 use crate::protocol::projection::{LocalRun, NotLocal, Observed, Projection};
@@ -27,7 +27,8 @@ impl Monitor {
     pub(crate) fn open_local(
         &mut self,
         id: &str,
-        (index, machine): (MachineIndex, &Machine),
+        index: MachineIndex,
+        machine: &Machine,
         projection: &Projection,
         observed: &ObservedMessage<'_>,
         now: Moment,
@@ -162,7 +163,7 @@ impl Monitor {
         let takes_part = observed.own || conversation.takes_part(&self.names, observed.sender);
         let bound = conversation.bound.len();
         let last_sent = |ends, bound_after| LastSent {
-            act: act_number(observed.act),
+            act: ActNumber::of(observed.act),
             reply_with: observed.reply_with,
             state,
             ends,
@@ -305,12 +306,12 @@ pub(crate) fn take_back_local(
     machine: &Machine,
     conversation: &mut Conversation,
     names: &mut Names,
-    (act, reply_with): (u8, u64),
+    sent: &SentMessage<'_>,
 ) -> bool {
     let Some(rare) = conversation.rare.as_deref_mut() else {
         return false;
     };
-    let is_it = |sent: &mut LastSent| sent.act == act && sent.reply_with == reply_with;
+    let is_it = |last: &mut LastSent| last.act == sent.act && last.reply_with == sent.reply_with;
     let Some((sent, run)) = rare.last_sent.take_if(is_it).zip(rare.local.as_mut()) else {
         return false;
     };

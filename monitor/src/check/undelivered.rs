@@ -5,13 +5,15 @@ use std::sync::Arc;
 use smallvec::SmallVec;
 
 use crate::check::alternatives::any_state_of;
+use crate::check::observed::SentMessage;
 use crate::check::roles::take_back_local;
 use crate::conversation::Conversation;
 use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
-use crate::conversation::party::{Side, act_number};
+use crate::conversation::party::Side;
 use crate::limits::MAX_ALIKE;
 use crate::monitor::Monitor;
+use crate::protocol::act::ActNumber;
 use crate::protocol::machine::{Machine, Scope};
 use crate::{Header, Moment};
 
@@ -24,8 +26,12 @@ impl Monitor {
         let (Some(id), Some(sender)) = (header.conversation(), header.sender_name()) else {
             return;
         };
-        let act = header.act();
-        let reply_with = self.fingerprints.of(header.reply_with_text());
+        let sent = SentMessage {
+            sender,
+            receiver,
+            act: ActNumber::of(header.act()),
+            reply_with: self.fingerprints.of(header.reply_with_text()),
+        };
         let library = Arc::clone(&self.library);
         let mains = self.table.find_all(id);
         let mains = mains.map(|(main, slot)| (main, slot.child));
@@ -40,19 +46,10 @@ impl Monitor {
                 if let Some(machine) = machine.filter(called)
                     && let Some(slot) = self.table.slot_mut(at)
                     && match slot.conversation.is_local() && agent == Some(sender) {
-                        true => take_back_local(
-                            machine,
-                            &mut slot.conversation,
-                            &mut self.names,
-                            (act_number(act), reply_with),
-                        ),
-                        false => take_back(
-                            machine,
-                            &mut slot.conversation,
-                            &self.names,
-                            (sender, receiver),
-                            (act_number(act), reply_with),
-                        ),
+                        true => {
+                            take_back_local(machine, &mut slot.conversation, &mut self.names, &sent)
+                        }
+                        false => take_back(machine, &mut slot.conversation, &self.names, &sent),
                     }
                 {
                     self.touch(main, now.millis());
@@ -68,15 +65,19 @@ impl Monitor {
     }
 }
 
-/// Takes a message of a sender to a receiver back, if it is the last one between them: the number of its
-/// performative, and its `reply-with`.
+/// Takes a message back, if it is the last one between its sender and its receiver.
 fn take_back(
     machine: &Machine,
     conversation: &mut Conversation,
     names: &Names,
-    (sender, receiver): (&str, &str),
-    (act, reply_with): (u8, u64),
+    sent: &SentMessage<'_>,
 ) -> bool {
+    let SentMessage {
+        sender,
+        receiver,
+        act,
+        reply_with,
+    } = *sent;
     let leads = names.is(conversation.initiator, sender)
         || conversation.is_designated(names, sender) && conversation.party(names, sender).is_none();
     let (at, side) = match machine.scope {

@@ -257,6 +257,7 @@ mod tests {
     use crate::conversation::party::{Details, EARLIER, Side, Worlds};
     use crate::conversation::rare::Copied;
     use crate::conversation::state::FAILED;
+    use crate::protocol::act::{ActNumber, INFORM};
     use crate::protocol::index::StateId;
     use crate::protocol::role::MessageRoles;
 
@@ -272,12 +273,12 @@ mod tests {
         };
         first.ask(Side::Initiator, 0, "");
         assert_eq!(first.allocated(), 0);
-        first.begin_step(Side::Initiator, 1, 7, false);
+        first.begin_step(Side::Initiator, ActNumber::of(INFORM), 7, false);
         first.ask(Side::Initiator, 7, "r7");
         assert_eq!(first.asked_text(0), "r7");
         assert_eq!(first.allocated(), size_of::<Details>());
-        assert!(!first.take_back(Side::Initiator, 1, 8));
-        assert!(first.take_back(Side::Initiator, 1, 7));
+        assert!(!first.take_back(Side::Initiator, ActNumber::of(INFORM), 8));
+        assert!(first.take_back(Side::Initiator, ActNumber::of(INFORM), 7));
         assert_eq!(first.state, FAILED);
         // Two worlds with details each.
         let uncertain = 3 * size_of::<Details>() + size_of::<Worlds>();
@@ -318,11 +319,11 @@ mod tests {
                 });
             }
             for party in conversation.parties.iter_mut().take(7) {
-                party.begin_step(Side::Initiator, 1, 7, false);
+                party.begin_step(Side::Initiator, ActNumber::of(INFORM), 7, false);
                 party.ask(Side::Initiator, 7, "r7");
             }
             // An uncertain one has two worlds.
-            assert!(conversation.parties[0].take_back(Side::Initiator, 1, 7));
+            assert!(conversation.parties[0].take_back(Side::Initiator, ActNumber::of(INFORM), 7));
             let mut unnamed = Party::new(None, StateId::FIRST);
             unnamed.ask(Side::Initiator, 7, "r7");
             let rare = conversation.rare();

@@ -1,10 +1,8 @@
 //! The state of one party of a conversation, its last messages, and the messages that it takes back.
 
-use fipa_acl::Performative;
-
 use crate::conversation::ids::Name;
 use crate::conversation::state::{AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, FAILED};
-use crate::protocol::act::{Act, CANCEL};
+use crate::protocol::act::{ActNumber, CANCEL};
 use crate::protocol::index::StateId;
 
 /// The state of a conversation with one participant or with all of them. It fits into one cache line: see
@@ -27,8 +25,8 @@ pub(crate) struct Party {
     /// have been sent before the cancel arrived. After an `inform`, `resume` is the state after that
     /// message.
     pub(crate) echo: bool,
-    /// [`act_number`] of the last message of each side; 0 for none.
-    pub(crate) acts: [u8; 2],
+    /// Performative of the last message of each side.
+    pub(crate) acts: [Option<ActNumber>; 2],
     /// Fingerprint of the last `reply-with` of each side; 0 for none.
     pub(crate) asked: [u64; 2],
     /// Deadline of the next message in milliseconds of the monotonic clock; 0 for none.
@@ -42,8 +40,7 @@ pub(crate) struct Party {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LastStep {
     side: Side,
-    /// [`act_number`] of the message.
-    act: u8,
+    act: ActNumber,
     state: StateId,
     resume: StateId,
     before: StateId,
@@ -51,7 +48,7 @@ pub(crate) struct LastStep {
     canceling_side: Side,
     echo: bool,
     /// Performative of the side that sent the message.
-    own_act: u8,
+    own_act: Option<ActNumber>,
     /// Whether the message is a cancel, which has changed [`Details::cancel`].
     cancels: bool,
     /// Whether it has [`StepValues`].
@@ -121,7 +118,7 @@ impl Party {
             last: Side::Other,
             canceling_side: Side::Initiator,
             echo: false,
-            acts: [0; 2],
+            acts: [None; 2],
             asked: [0; 2],
             deadline: 0,
             last_step: None,
@@ -167,7 +164,13 @@ impl Party {
     }
 
     /// Records the message that is about to change the party, and whether it is a cancel.
-    pub(crate) fn begin_step(&mut self, side: Side, act: u8, reply_with: u64, cancels: bool) {
+    pub(crate) fn begin_step(
+        &mut self,
+        side: Side,
+        act: ActNumber,
+        reply_with: u64,
+        cancels: bool,
+    ) {
         let index = side_index(side);
         let (own_asked, deadline) = (self.asked[index], self.deadline);
         let has_values = cancels || [reply_with, own_asked, deadline] != [0; 3];
@@ -224,12 +227,12 @@ impl Party {
 
     /// Takes a message back, because it was not delivered, or because that is uncertain. Returns whether
     /// the message is the last one.
-    pub(crate) fn take_back(&mut self, side: Side, act: u8, reply_with: u64) -> bool {
+    pub(crate) fn take_back(&mut self, side: Side, act: ActNumber, reply_with: u64) -> bool {
         let values = self.step_values();
         let is_it = |step: &LastStep| {
             step.side == side && step.act == act && values.reply_with == reply_with
         };
-        let cancels = act == act_number(CANCEL);
+        let cancels = act == ActNumber::of(CANCEL);
         let Some(step) = self.last_step.filter(is_it) else {
             // A message of the other side may have crossed the cancel, or was taken for its answer.
             if cancels
@@ -299,7 +302,7 @@ impl Party {
 
     /// Whether no message was sent yet.
     pub(crate) fn is_fresh(&self) -> bool {
-        self.acts == [0; 2]
+        self.acts == [None; 2]
     }
 
     /// Records the `reply-with` of a message, of which `text` is the text.
@@ -387,20 +390,6 @@ pub(crate) fn side_index(side: Side) -> usize {
     }
 }
 
-/// Returns the number of a standard performative, plus 1, and 255 for other performatives.
-pub(crate) fn act_number(act: Act<'_>) -> u8 {
-    match act {
-        Act::Standard(number) => number + 1,
-        Act::Other(_) => u8::MAX,
-    }
-}
-
-/// Returns the standard performative with this [`act_number`].
-pub(crate) fn standard_act(number: u8) -> Option<Act<'static>> {
-    let index = number.checked_sub(1)?;
-    (usize::from(index) < Performative::STANDARD.len()).then_some(Act::Standard(index))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -437,10 +426,10 @@ mod tests {
                 party.ask(Side::Initiator, asked, "");
             }
             let before = (party.asked, *party.earlier(0));
-            party.begin_step(Side::Initiator, 1, 99, false);
+            party.begin_step(Side::Initiator, ActNumber::of(CANCEL), 99, false);
             party.ask(Side::Initiator, 99, "");
             assert_ne!((party.asked, *party.earlier(0)), before, "{count}");
-            assert!(party.take_back(Side::Initiator, 1, 99));
+            assert!(party.take_back(Side::Initiator, ActNumber::of(CANCEL), 99));
             party.settle(World::Missing);
             assert_eq!((party.asked, *party.earlier(0)), before, "{count}");
         }

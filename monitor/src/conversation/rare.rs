@@ -6,6 +6,7 @@ use smallvec::SmallVec;
 use crate::conversation::bindings::RoleBinding;
 use crate::conversation::ids::{Name, PartyIndex};
 use crate::conversation::party::Party;
+use crate::protocol::act::ActNumber;
 use crate::protocol::index::StateId;
 use crate::protocol::projection::LocalRun;
 use crate::protocol::role::{MessageRoles, RoleSet};
@@ -76,8 +77,7 @@ impl Rare {
 /// The last message of the monitored agent in a conversation that its role sees.
 #[derive(Debug)]
 pub(crate) struct LastSent {
-    /// [`act_number`] of the message.
-    pub(crate) act: u8,
+    pub(crate) act: ActNumber,
     pub(crate) reply_with: u64,
     /// The state before it.
     pub(crate) state: StateId,

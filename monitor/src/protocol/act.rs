@@ -1,5 +1,7 @@
 //! Performatives in the form that the machines use: numbers for the 22 standard ones, and sets.
 
+use std::num::NonZeroU8;
+
 use fipa_acl::{Pattern, PatternError, Performative};
 
 use crate::protocol::spelling::one_edit_apart;
@@ -51,11 +53,6 @@ impl<'a> Act<'a> {
         })
     }
 
-    /// Whether this is a number of [`act_number`](crate::conversation::act_number), or 0 for none.
-    pub(crate) fn is_number(number: u8) -> bool {
-        usize::from(number) <= Performative::STANDARD.len() || number == u8::MAX
-    }
-
     pub(crate) fn named(name: &'a str) -> Self {
         let mut standard = (0..).zip(&Performative::STANDARD);
         match standard.find(|(_, act)| act.as_str().eq_ignore_ascii_case(name)) {
@@ -69,6 +66,38 @@ impl<'a> Act<'a> {
             Self::Standard(number) => standard_name(number),
             Self::Other(name) => name,
         }
+    }
+}
+
+/// A performative in one byte: its index in [`Performative::STANDARD`] plus 1, and 255 for all user-defined ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(transparent)]
+pub(crate) struct ActNumber(NonZeroU8);
+
+impl ActNumber {
+    #[inline]
+    pub(crate) fn of(act: Act<'_>) -> Self {
+        let next = match act {
+            Act::Standard(number) => NonZeroU8::new(number.wrapping_add(1)),
+            Act::Other(_) => None,
+        };
+        Self(next.unwrap_or(NonZeroU8::MAX))
+    }
+
+    /// `None` for a byte that is no number. A host from which an agent moves might send one.
+    pub(crate) fn from_byte(byte: u8) -> Option<Self> {
+        let is_number = usize::from(byte) <= Performative::STANDARD.len() || byte == u8::MAX;
+        NonZeroU8::new(byte).filter(|_| is_number).map(Self)
+    }
+
+    pub(crate) fn byte(self) -> u8 {
+        self.0.get()
+    }
+
+    /// The performative, if it is a standard one.
+    pub(crate) fn standard(self) -> Option<Act<'static>> {
+        let index = self.byte() - 1;
+        (usize::from(index) < Performative::STANDARD.len()).then_some(Act::Standard(index))
     }
 }
 
@@ -195,12 +224,22 @@ pub(crate) fn is_word(text: &str) -> bool {
 mod tests {
     use super::*;
 
-    /// A host from which an agent moves might send other numbers.
     #[test]
     fn the_numbers_of_performatives_are_known() {
-        // None, the 22 performatives of FIPA00037, and any other.
-        assert!((0..=22).chain([255]).all(Act::is_number));
-        assert!(!(23..255).any(Act::is_number));
+        // The 22 performatives of FIPA00037, and any other.
+        for byte in (1..=22).chain([255]) {
+            assert_eq!(ActNumber::from_byte(byte).map(ActNumber::byte), Some(byte));
+        }
+        assert!(
+            (23..255)
+                .chain([0])
+                .all(|byte| ActNumber::from_byte(byte).is_none())
+        );
+        assert_eq!(size_of::<[Option<ActNumber>; 2]>(), 2);
+        for act in [CANCEL, INFORM] {
+            assert_eq!(ActNumber::of(act).standard(), Some(act));
+        }
+        assert_eq!(ActNumber::of(Act::Other("ping")).standard(), None);
     }
 
     #[test]
