@@ -25,11 +25,20 @@ pub struct Fence {
     run: u64,
 }
 
+/// Position of a fence among those of its owner and resource.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Position {
+    /// Number of the life of the owner.
+    pub(crate) epoch: u64,
+    /// Number of the grant in that life.
+    pub(crate) number: u64,
+}
+
 impl Fence {
     pub(crate) fn new(
         owner: &LockPeer,
         resource: &Resource,
-        (epoch, number): (u64, u64),
+        Position { epoch, number }: Position,
         run: u64,
     ) -> Self {
         Self {
@@ -130,7 +139,10 @@ impl FromStr for Fence {
         let run = u64::from_str_radix(run, 16).map_err(|_| FenceError::Form)?;
         let owner = LockPeer::new(&owner.replace("%23", "#").replace("%25", "%"), 0)?;
         let resource = Resource::new(resource)?;
-        let position = (digits(epoch)?, digits(number)?);
+        let position = Position {
+            epoch: digits(epoch)?,
+            number: digits(number)?,
+        };
         Ok(Self::new(&owner, &resource, position, run))
     }
 }
@@ -251,7 +263,15 @@ mod tests {
             let owner = LockPeer::new(owner, 1).unwrap();
             let resource = Resource::new(resource).unwrap();
             let run = u64::from_str_radix(RUN, 16).unwrap();
-            let fence = Fence::new(&owner, &resource, (7, 42), run);
+            let fence = Fence::new(
+                &owner,
+                &resource,
+                Position {
+                    epoch: 7,
+                    number: 42,
+                },
+                run,
+            );
             assert_eq!(fence.to_string(), text);
             assert_eq!(text.parse(), Ok(fence));
         }

@@ -57,7 +57,7 @@ pub struct History {
     /// Agents that hold the resource without a fence.
     inside: BTreeSet<LockPeer>,
     /// Highest fence that an agent held and holds no more.
-    left: (u64, u64),
+    highest_ended: (u64, u64),
     /// Whether the owner has forgotten a life.
     forgot: bool,
     violation: Option<Violation>,
@@ -86,7 +86,7 @@ impl History {
             handled: None,
             held: BTreeMap::new(),
             inside: BTreeSet::new(),
-            left: (0, 0),
+            highest_ended: (0, 0),
             forgot: false,
             violation: None,
         }
@@ -255,8 +255,8 @@ impl History {
     /// crashed holds nothing.
     pub fn holds(&mut self, agent: &LockPeer, fence: Option<&Fence>) {
         let Some(fence) = fence else {
-            if let Some(left) = self.held.remove(agent) {
-                self.left = self.left.max(left.position());
+            if let Some(fence) = self.held.remove(agent) {
+                self.highest_ended = self.highest_ended.max(fence.position());
             }
             return;
         };
@@ -266,13 +266,16 @@ impl History {
         }
         self.seen = self.seen.max(fence.position());
         if let Some(before) = before {
-            self.left = self.left.max(before.position());
+            self.highest_ended = self.highest_ended.max(before.position());
         }
         if self.forgot {
             return;
         }
-        if fence.position() <= self.left {
-            let text = format!("{agent} holds {fence} after {:?} has ended", self.left);
+        if fence.position() <= self.highest_ended {
+            let text = format!(
+                "{agent} holds {fence} after {:?} has ended",
+                self.highest_ended
+            );
             self.break_invariant(5, text);
         }
         if self.held.len() > 1 {

@@ -13,6 +13,7 @@
 use std::collections::BTreeMap;
 
 use crate::faults::{Fault, fault};
+use crate::fence::Position;
 use crate::queue::Queue;
 use crate::{Act, Conversation, Fence, Gate, LockPeer, Millis, OwnerState, Refusal, Resource};
 
@@ -219,7 +220,10 @@ impl Owner {
 
     /// The last fence of this life.
     pub(crate) fn last(&self) -> Option<Fence> {
-        let position = (self.epoch, self.number);
+        let position = Position {
+            epoch: self.epoch,
+            number: self.number,
+        };
         (self.number > 0).then(|| Fence::new(&self.me, &self.resource, position, self.run))
     }
 
@@ -259,7 +263,8 @@ impl Owner {
         now: Millis,
         from: &LockPeer,
         conversation: &Conversation,
-        (asked, place): (Millis, Option<u32>),
+        asked: Millis,
+        place: Option<u32>,
         out: &mut Vec<OwnerStep>,
     ) {
         self.confirm(now, from, conversation, Some(asked), out);
@@ -271,8 +276,8 @@ impl Owner {
     }
 
     /// Handles a sign of life of a member that was suspected.
-    pub(crate) fn heard(&mut self, now: Millis, peer: &LockPeer, out: &mut Vec<OwnerStep>) {
-        self.queue.heard(peer);
+    pub(crate) fn sign_of_life(&mut self, now: Millis, peer: &LockPeer, out: &mut Vec<OwnerStep>) {
+        self.queue.sign_of_life(peer);
         self.handle_timeout(now, out);
     }
 
@@ -290,7 +295,7 @@ impl Owner {
         {
             // The report was repeated. One answer follows, to the last repetition.
             waiter.asked = waiter.asked.max(asked);
-            self.queue.heard(from);
+            self.queue.sign_of_life(from);
             self.handle_timeout(now, out);
             return;
         }
@@ -515,7 +520,10 @@ impl Owner {
             if !fault!(self.fault, ReuseFence) || self.number == 0 {
                 self.number += 1;
             }
-            let position = (self.epoch, self.number);
+            let position = Position {
+                epoch: self.epoch,
+                number: self.number,
+            };
             let fence = Fence::new(&self.me, &self.resource, position, self.run);
             grant.fence = Some(fence.clone());
             grant.expires = Some(now.saturating_add(self.lease));

@@ -49,7 +49,7 @@ impl Probes {
         }
     }
 
-    pub(crate) fn heard(&mut self, now: Millis, options: &Options, peer: &LockPeer) {
+    pub(crate) fn sign_of_life(&mut self, now: Millis, options: &Options, peer: &LockPeer) {
         if let Some(probed) = self.peers.get_mut(peer) {
             probed.sent = 0;
             probed.next = now.saturating_add(options.probe_interval);

@@ -663,7 +663,7 @@ fn a_member_with_another_algorithm_is_refused_with_a_text() {
             let (mut net, _) = found(of_owner, of_member);
             let failure = Failure::Algorithm {
                 owner: of_owner,
-                here: of_member,
+                own: of_member,
             };
             let text = format!(
                 "the owner uses the algorithm {of_owner}, and this agent was told to use {of_member}"

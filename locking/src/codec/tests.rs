@@ -2,6 +2,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::Fence;
+use crate::fence::Position;
 
 fn id(name: &str) -> AgentId {
     AgentId::new(name).unwrap()
@@ -261,6 +262,7 @@ fn name() -> impl Strategy<Value = String> {
 fn act() -> impl Strategy<Value = (Algorithm, Act)> {
     let number = 0..=i32::MAX as u64;
     let position = (any::<u64>(), any::<u64>());
+    let position = position.prop_map(|(epoch, number)| Position { epoch, number });
     let fence = (name(), position, any::<u64>()).prop_map(|(owner, position, run)| {
         let owner = crate::LockPeer::new(&owner, 0).unwrap();
         Fence::new(&owner, &Resource::new("bay").unwrap(), position, run)

@@ -2,10 +2,8 @@
 
 use super::event::{Action, Event, Failure};
 use super::request::Phase;
-use super::{Actions, Locks, MAX_FOREIGN};
-use crate::{
-    Act, Algorithm, Conversation, LockDialect, LockPeer, Millis, MutualExclusion, Resource,
-};
+use super::{Actions, Locks, MAX_FOREIGN, Received};
+use crate::{Act, Algorithm, LockDialect, LockPeer, Millis, MutualExclusion, Resource};
 
 impl<A: MutualExclusion> Locks<A> {
     /// Records the owner of a resource, as the directory knows it. Then no message has to find it.
@@ -39,15 +37,14 @@ impl<A: MutualExclusion> Locks<A> {
         self.settle(now, out);
     }
 
-    pub(super) fn discover(
-        &mut self,
-        now: Millis,
-        from: &LockPeer,
-        resource: &Resource,
-        conversation: &Conversation,
-        (act, algorithm): (&Act, Option<Algorithm>),
-        out: &mut Actions,
-    ) {
+    pub(super) fn discover(&mut self, now: Millis, received: Received<'_>, out: &mut Actions) {
+        let Received {
+            from,
+            resource,
+            conversation,
+            algorithm,
+            act,
+        } = received;
         // An earlier registration of this agent is no other owner.
         if from.name() == self.me.name() {
             return;

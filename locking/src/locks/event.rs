@@ -141,12 +141,12 @@ pub enum Failure {
     #[error("the owner refuses: {0}")]
     Refused(Refusal),
     /// The owner names another algorithm than the one that this agent was told to use.
-    #[error("the owner uses the algorithm {owner}, and this agent was told to use {here}")]
+    #[error("the owner uses the algorithm {owner}, and this agent was told to use {own}")]
     Algorithm {
         /// MutualExclusion of the owner.
         owner: Algorithm,
         /// MutualExclusion of this agent.
-        here: Algorithm,
+        own: Algorithm,
     },
     /// A resource of the claim was lost before all were acquired.
     #[error("the lock of another resource of the claim was lost")]

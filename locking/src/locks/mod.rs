@@ -26,7 +26,7 @@ use crate::algorithm::Member;
 use crate::greeted::Greeted;
 use crate::probes::{ProbeStep, Probes};
 use crate::{
-    Act, Algorithm, Content, Fence, Gate, LockDialect, LockMessage, LockPeer, Millis,
+    Act, Algorithm, Content, Conversation, Fence, Gate, LockDialect, LockMessage, LockPeer, Millis,
     MutualExclusion, Options, Resource,
 };
 
@@ -62,6 +62,16 @@ pub struct Locks<A> {
     local: VecDeque<LockMessage>,
     /// Resources whose state has changed. Empty between calls.
     touched: BTreeSet<Resource>,
+}
+
+/// A message about a resource.
+#[derive(Debug, Clone, Copy)]
+struct Received<'a> {
+    from: &'a LockPeer,
+    resource: &'a Resource,
+    conversation: &'a Conversation,
+    algorithm: Option<Algorithm>,
+    act: &'a Act,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -177,11 +187,11 @@ impl<A: MutualExclusion> Locks<A> {
         if *from == self.me || !self.admit_member(now, from, message.dialect, out) {
             return;
         }
-        self.probes.heard(now, &self.options, from);
+        self.probes.sign_of_life(now, &self.options, from);
         self.dispatch(now, from, message, out);
         // The message may be the withdrawal of the request that waits.
         if was_suspected {
-            self.heard_again(now, from, out);
+            self.alive_again(now, from, out);
         }
         self.settle(now, out);
     }
@@ -247,33 +257,32 @@ impl<A: MutualExclusion> Locks<A> {
                 if self.is_refused(from, message, out) {
                     return;
                 }
-                let algorithm = message.algorithm;
+                let received = Received {
+                    from,
+                    resource,
+                    conversation,
+                    algorithm: message.algorithm,
+                    act,
+                };
                 match act {
                     Act::Query { .. } | Act::Owned | Act::Contested => {
-                        self.discover(now, from, resource, conversation, (act, algorithm), out);
+                        self.discover(now, received, out);
                     }
                     Act::Seen { fence } => {
                         self.at_owner(resource, out, |core, _| core.seen(now, fence));
                     }
                     Act::Ask { .. } | Act::Confirm { .. } | Act::Renew { .. } | Act::Release => {
-                        self.for_owner(now, from, resource, conversation, act, out);
+                        self.for_owner(now, received, out);
                     }
                     Act::Granted { .. } | Act::Refused { .. } => {
-                        self.for_holder(now, from, resource, conversation, act, out);
+                        self.for_holder(now, received, out);
                     }
                     Act::Place { .. }
                     | Act::Request { .. }
                     | Act::Agree { .. }
                     | Act::RequestToken { .. }
                     | Act::Token(_) => {
-                        self.for_algorithm(
-                            now,
-                            from,
-                            resource,
-                            conversation,
-                            (act, algorithm),
-                            out,
-                        );
+                        self.for_algorithm(now, received, out);
                     }
                 }
             }

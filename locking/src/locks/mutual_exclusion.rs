@@ -1,22 +1,19 @@
 //! The algorithm of a resource, which decides on the next holder.
 
-use super::{Actions, Locks, MAX_FOREIGN};
+use super::{Actions, Locks, MAX_FOREIGN, Received};
 use crate::algorithm::{Context, Step};
 use crate::faults::fault;
-use crate::{
-    Act, Algorithm, Conversation, Gate, LockDialect, LockPeer, Millis, MutualExclusion, Resource,
-};
+use crate::{Act, Gate, LockDialect, Millis, MutualExclusion, Resource};
 
 impl<A: MutualExclusion> Locks<A> {
-    pub(super) fn for_algorithm(
-        &mut self,
-        now: Millis,
-        from: &LockPeer,
-        resource: &Resource,
-        conversation: &Conversation,
-        (act, algorithm): (&Act, Option<Algorithm>),
-        out: &mut Actions,
-    ) {
+    pub(super) fn for_algorithm(&mut self, now: Millis, received: Received<'_>, out: &mut Actions) {
+        let Received {
+            from,
+            resource,
+            conversation,
+            algorithm,
+            act,
+        } = received;
         let kind = algorithm.unwrap_or(self.kind);
         if !self.resources.contains_key(resource) {
             match act {

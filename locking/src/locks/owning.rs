@@ -1,12 +1,12 @@
 //! Resources that this agent owns.
 
 use super::event::{Action, Event};
-use super::{Actions, Locks};
+use super::{Actions, Locks, Received};
 use crate::faults::fault;
 use crate::owner::{Grant, Owner, OwnerStep};
 use crate::{
-    Act, Algorithm, Conversation, Fence, Gate, LockDialect, LockPeer, Millis, MutualExclusion,
-    OwnerState, Refusal, Resource,
+    Act, Algorithm, Fence, Gate, LockDialect, LockPeer, Millis, MutualExclusion, OwnerState,
+    Refusal, Resource,
 };
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -126,20 +126,19 @@ impl<A: MutualExclusion> Locks<A> {
         Some(&self.resources.get(resource)?.owned.as_ref()?.core)
     }
 
-    pub(super) fn for_owner(
-        &mut self,
-        now: Millis,
-        from: &LockPeer,
-        resource: &Resource,
-        conversation: &Conversation,
-        act: &Act,
-        out: &mut Actions,
-    ) {
+    pub(super) fn for_owner(&mut self, now: Millis, received: Received<'_>, out: &mut Actions) {
+        let Received {
+            from,
+            resource,
+            conversation,
+            act,
+            ..
+        } = received;
         let owns = self.owner(resource).is_some();
         let has_token = self.kind_of(resource).has_token();
         match act {
             Act::Ask { asked, place } if owns => self.at_owner(resource, out, |core, steps| {
-                core.ask(now, from, conversation, (*asked, *place), steps);
+                core.ask(now, from, conversation, *asked, *place, steps);
             }),
             Act::Confirm { asked } if owns => self.at_owner(resource, out, |core, steps| {
                 if has_token {

@@ -312,7 +312,7 @@ impl<A: MutualExclusion> Locks<A> {
     // ----- members
 
     /// Handles a sign of life of a member that was suspected.
-    pub(super) fn heard_again(&mut self, now: Millis, peer: &LockPeer, out: &mut Actions) {
+    pub(super) fn alive_again(&mut self, now: Millis, peer: &LockPeer, out: &mut Actions) {
         let owned = self.resources.iter().filter(|(_, entry)| {
             let core = entry.owned.as_ref().map(|owned| &owned.core);
             entry.kind == Algorithm::OwnerQueue
@@ -320,7 +320,9 @@ impl<A: MutualExclusion> Locks<A> {
         });
         let owned: Vec<_> = owned.map(|(resource, _)| resource.clone()).collect();
         for resource in owned {
-            self.at_owner(&resource, out, |core, steps| core.heard(now, peer, steps));
+            self.at_owner(&resource, out, |core, steps| {
+                core.sign_of_life(now, peer, steps)
+            });
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use super::claim::{Claim, ClaimId};
 use super::event::{Action, Event, Failure};
-use super::{Actions, Locks};
+use super::{Actions, Locks, Received};
 use crate::algorithm::Step;
 use crate::holder::{Holder, HolderStep};
 use crate::{
@@ -38,7 +38,7 @@ impl<A: MutualExclusion> Locks<A> {
         let retry = now.saturating_add(self.options.retry);
         let until = now.saturating_add(self.options.discovery);
         let conversation = Conversation::new(self.me.shared_name().clone(), self.next_conversation);
-        let (here, accepts) = (self.kind, self.accepts(self.kind_of(resource)));
+        let (own, accepts) = (self.kind, self.accepts(self.kind_of(resource)));
         let Some(entry) = self.resources.get_mut(resource) else {
             return;
         };
@@ -55,7 +55,7 @@ impl<A: MutualExclusion> Locks<A> {
         };
         if entry.owner.is_some() && entry.owned.is_none() && !accepts {
             let owner = entry.kind;
-            return self.fail(now, claim, Failure::Algorithm { owner, here }, out);
+            return self.fail(now, claim, Failure::Algorithm { owner, own }, out);
         }
         if entry.owner.is_none() {
             let phase = Phase::Discovering { until, next: retry };
@@ -161,15 +161,14 @@ impl<A: MutualExclusion> Locks<A> {
         self.touched.insert(resource.clone());
     }
 
-    pub(super) fn for_holder(
-        &mut self,
-        now: Millis,
-        from: &LockPeer,
-        resource: &Resource,
-        conversation: &Conversation,
-        act: &Act,
-        out: &mut Actions,
-    ) {
+    pub(super) fn for_holder(&mut self, now: Millis, received: Received<'_>, out: &mut Actions) {
+        let Received {
+            from,
+            resource,
+            conversation,
+            act,
+            ..
+        } = received;
         let current = self
             .resources
             .get_mut(resource)

@@ -88,7 +88,7 @@ pub(super) struct State {
     device: Admission,
     admitted: Option<usize>,
     ticks: u8,
-    left: Faults,
+    remaining: Faults,
     /// Registrations that have ended, and the agents that have no proof of it.
     unnoticed: BTreeSet<(LockPeer, u8)>,
     /// Registrations, and the agents whose directory does not list them yet.
@@ -104,7 +104,7 @@ struct Agent {
     paused: bool,
     claim: Option<ClaimId>,
     acquired: bool,
-    left: u8,
+    remaining: u8,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -193,7 +193,7 @@ impl System {
             paused: false,
             claim: None,
             acquired: false,
-            left: self.claims[usize::from(agent)],
+            remaining: self.claims[usize::from(agent)],
         }
     }
 
@@ -217,7 +217,7 @@ impl System {
             device,
             admitted: None,
             ticks: 0,
-            left: self.faults,
+            remaining: self.faults,
             unnoticed: BTreeSet::new(),
             unlisted: BTreeSet::new(),
             turns: Turns::default(),
@@ -447,9 +447,9 @@ impl System {
     /// Registers an agent again.
     fn again(&self, state: &mut State, agent: u8) {
         let registration = state.agents[usize::from(agent)].me.registration() + 1;
-        let left = state.agents[usize::from(agent)].left;
+        let remaining = state.agents[usize::from(agent)].remaining;
         state.agents[usize::from(agent)] = Agent {
-            left,
+            remaining,
             ..self.agent(agent, registration)
         };
         if self.foreign_owner {
@@ -549,17 +549,17 @@ impl System {
         state
             .agents
             .iter()
-            .all(|agent| agent.locks.is_none() || (agent.claim.is_none() && agent.left == 0))
+            .all(|agent| agent.locks.is_none() || (agent.claim.is_none() && agent.remaining == 0))
     }
 
     /// Where grants are counted, the others begin after the crash.
     fn may_lock(&self, state: &State, agent: u8) -> bool {
-        !self.turns || agent == 1 || state.left.crashes == 0
+        !self.turns || agent == 1 || state.remaining.crashes == 0
     }
 
     /// Where grants are counted, the agent that holds first is killed.
     fn may_release(&self, state: &State, agent: u8) -> bool {
-        !self.turns || agent != 1 || state.left.crashes == 0
+        !self.turns || agent != 1 || state.remaining.crashes == 0
     }
 
     /// A crash of an agent that holds the resource. Other crashes have their own configurations.
@@ -622,17 +622,17 @@ impl Model for System {
         if state.broken().is_some() {
             return;
         }
-        let left = state.left;
+        let remaining = state.remaining;
         let deliverable = if self.turns { 1 } else { usize::MAX };
         for (to, from, message) in state.network.iter().take(deliverable) {
             let (to, from, message) = (to.clone(), from.clone(), message.clone());
-            if left.losses > 0 {
+            if remaining.losses > 0 {
                 actions.push(Step::Lose(to.clone(), from.clone(), message.clone()));
             }
             if state.is_paused(&to) {
                 continue;
             }
-            if left.duplicates > 0 {
+            if remaining.duplicates > 0 {
                 actions.push(Step::Duplicate(to.clone(), from.clone(), message.clone()));
             }
             actions.push(Step::Deliver(to, from, message));
@@ -647,31 +647,33 @@ impl Model for System {
                 continue;
             }
             match (agent.claim, agent.acquired) {
-                (None, _) if agent.left > 0 && self.may_lock(state, number) => {
+                (None, _) if agent.remaining > 0 && self.may_lock(state, number) => {
                     actions.push(Step::Lock(number));
                 }
                 (Some(_), true) if self.may_release(state, number) => {
                     actions.push(Step::Release(number));
                 }
-                (Some(_), false) if left.withdrawals > 0 => actions.push(Step::Withdraw(number)),
+                (Some(_), false) if remaining.withdrawals > 0 => {
+                    actions.push(Step::Withdraw(number))
+                }
                 _ => {}
             }
-            if number > 0 && left.crashes > 0 && self.may_crash(agent) {
+            if number > 0 && remaining.crashes > 0 && self.may_crash(agent) {
                 actions.push(Step::Crash(number));
             }
             // An agent of a queue can also be stopped while it waits for its turn.
             let waits = self.kind == Algorithm::OwnerQueue && agent.claim.is_some();
-            if left.pauses > 0 && (agent.acquired || waits) {
+            if remaining.pauses > 0 && (agent.acquired || waits) {
                 actions.push(Step::Pause(number));
             }
         }
-        if left.restarts > 0 {
+        if remaining.restarts > 0 {
             actions.push(Step::Restart);
         }
-        if left.moves > 0 {
+        if remaining.moves > 0 {
             actions.push(Step::Move);
         }
-        if left.commands > 0 {
+        if remaining.commands > 0 {
             actions.extend((0..state.grants.len()).map(Step::Command));
         }
         for (peer, agent) in &state.unnoticed {
@@ -696,7 +698,7 @@ impl Model for System {
             Step::Lock(number) => {
                 let owner = self.foreign_owner.then(|| state.agents[0].me.clone());
                 let agent = &mut state.agents[usize::from(number)];
-                agent.left -= 1;
+                agent.remaining -= 1;
                 let mut actions = Vec::new();
                 let locks = agent.locks.as_mut()?;
                 if let Some(owner) = owner {
@@ -714,7 +716,7 @@ impl Model for System {
             }
             Step::Release(number) | Step::Withdraw(number) => {
                 if matches!(step, Step::Withdraw(_)) {
-                    state.left.withdrawals -= 1;
+                    state.remaining.withdrawals -= 1;
                 }
                 let agent = &mut state.agents[usize::from(number)];
                 agent.acquired = false;
@@ -729,11 +731,11 @@ impl Model for System {
                 self.deliver(state, &key.0, &key.1, &key.2);
             }
             Step::Duplicate(to, from, message) => {
-                state.left.duplicates -= 1;
+                state.remaining.duplicates -= 1;
                 self.deliver(state, &to, &from, &message);
             }
             Step::Lose(to, from, message) => {
-                state.left.losses -= 1;
+                state.remaining.losses -= 1;
                 state.network.remove(&(to, from, message));
             }
             Step::Tick => {
@@ -754,7 +756,7 @@ impl Model for System {
                 self.list(state, &peer, number);
             }
             Step::Pause(number) => {
-                state.left.pauses -= 1;
+                state.remaining.pauses -= 1;
                 state.agents[usize::from(number)].paused = true;
             }
             Step::Resume(number) => {
@@ -762,23 +764,23 @@ impl Model for System {
                 self.time_out(state, number);
             }
             Step::Crash(number) => {
-                state.left.crashes -= 1;
+                state.remaining.crashes -= 1;
                 state.turns.disturbed();
                 self.end(state, number);
             }
             Step::Return(number) => self.again(state, number),
             Step::Restart => {
-                state.left.restarts -= 1;
+                state.remaining.restarts -= 1;
                 self.restart_owner(state);
             }
             Step::Move => {
-                state.left.moves -= 1;
+                state.remaining.moves -= 1;
                 state.host = 1 - state.host;
                 state.history.owner_moved();
                 self.restart_owner(state);
             }
             Step::Command(grant) => {
-                state.left.commands -= 1;
+                state.remaining.commands -= 1;
                 self.command(state, grant);
             }
         }

@@ -42,7 +42,7 @@ pub(crate) struct Waiter {
     /// Place in the owner's life before.
     former: Option<u32>,
     /// Place that the member was told.
-    told: Option<u32>,
+    last_place_sent: Option<u32>,
     presence: Presence,
     /// Whether it has gone to the end.
     is_moved: bool,
@@ -63,7 +63,7 @@ impl Waiter {
             conversation,
             asked,
             former: None,
-            told: None,
+            last_place_sent: None,
             presence: Presence::Present,
             is_moved: false,
         }
@@ -117,7 +117,7 @@ impl Queue {
             Some(waiter) => {
                 waiter.conversation = conversation.clone();
                 waiter.asked = asked;
-                waiter.told = None;
+                waiter.last_place_sent = None;
                 waiter.presence = Presence::Present;
                 true
             }
@@ -154,7 +154,7 @@ impl Queue {
     }
 
     /// Handles a sign of life.
-    pub(crate) fn heard(&mut self, peer: &LockPeer) {
+    pub(crate) fn sign_of_life(&mut self, peer: &LockPeer) {
         if let Some(waiter) = self.find(peer) {
             waiter.presence = Presence::Present;
         }
@@ -208,8 +208,8 @@ impl Queue {
             return;
         }
         for (place, waiter) in (1..=MAX_PLACE).zip(&mut self.waiters) {
-            if waiter.told != Some(place) {
-                waiter.told = Some(place);
+            if waiter.last_place_sent != Some(place) {
+                waiter.last_place_sent = Some(place);
                 out.push(OwnerStep::Send {
                     to: waiter.peer.clone(),
                     conversation: waiter.conversation.clone(),
@@ -219,7 +219,7 @@ impl Queue {
         }
         for waiter in self.waiters.iter_mut().skip(MAX_PLACE as usize) {
             // It went to the end.
-            waiter.told = None;
+            waiter.last_place_sent = None;
         }
     }
 

@@ -23,17 +23,17 @@ struct Expected {
     moved: Vec<usize>,
     /// Agents that were asked for a sign of life, and the end of the wait.
     asked: Vec<(usize, Millis)>,
-    told: Vec<(usize, u64, u32)>,
+    last_places_sent: Vec<(usize, u64, u32)>,
 }
 
 impl Expected {
     fn forget(&mut self, agent: usize) {
         self.order.retain(|(it, _)| *it != agent);
         self.moved.retain(|it| *it != agent);
-        self.heard(agent);
+        self.sign_of_life(agent);
     }
 
-    fn heard(&mut self, agent: usize) {
+    fn sign_of_life(&mut self, agent: usize) {
         self.suspected.retain(|it| *it != agent);
         self.asked.retain(|(it, _)| *it != agent);
     }
@@ -77,7 +77,7 @@ impl Expected {
         let now: Vec<_> = first
             .map(|((agent, of), place)| (*agent, *of, place))
             .collect();
-        let before = std::mem::replace(&mut self.told, now.clone());
+        let before = std::mem::replace(&mut self.last_places_sent, now.clone());
         now.into_iter().filter(|it| !before.contains(it)).collect()
     }
 }
@@ -96,7 +96,7 @@ fn random_requests_losses_and_signs_of_life_keep_the_order() {
                 0..4 => {
                     // A new request, which replaces the one before.
                     queue.add(&peer(agent), &of(conversation), Some(now));
-                    expected.heard(agent);
+                    expected.sign_of_life(agent);
                     match expected.order.iter_mut().find(|(it, _)| *it == agent) {
                         Some(known) => known.1 = conversation,
                         None => expected.order.push((agent, conversation)),
@@ -129,8 +129,8 @@ fn random_requests_losses_and_signs_of_life_keep_the_order() {
                     }
                 }
                 8 => {
-                    queue.heard(&peer(agent));
-                    expected.heard(agent);
+                    queue.sign_of_life(&peer(agent));
+                    expected.sign_of_life(agent);
                 }
                 _ => {
                     let next = queue.next(now, Gate::Open, &mut out);
@@ -153,7 +153,7 @@ fn random_requests_losses_and_signs_of_life_keep_the_order() {
             }
             out.clear();
             queue.tell(&mut out);
-            let told = expected.tell().into_iter().map(|(agent, number, place)| {
+            let places = expected.tell().into_iter().map(|(agent, number, place)| {
                 let (to, conversation) = (peer(agent), of(number));
                 let act = Act::Place { place };
                 OwnerStep::Send {
@@ -162,7 +162,7 @@ fn random_requests_losses_and_signs_of_life_keep_the_order() {
                     act,
                 }
             });
-            assert_eq!(out, told.collect::<Vec<_>>(), "seed {seed}");
+            assert_eq!(out, places.collect::<Vec<_>>(), "seed {seed}");
             let order: Vec<_> = queue.iter().map(|waiter| waiter.peer.clone()).collect();
             let agents: Vec<_> = expected.order.iter().map(|it| peer(it.0)).collect();
             assert_eq!(order, agents, "seed {seed}");
