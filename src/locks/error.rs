@@ -119,10 +119,10 @@ impl LockError {
                 owner: owner.name().to_owned(),
             },
             Failure::TimedOut { ahead } => Self::TimedOut { resource, ahead },
-            Failure::Algorithm { owner, here } => Self::OtherAlgorithm {
+            Failure::Algorithm { owner, own } => Self::OtherAlgorithm {
                 resource,
                 owner,
-                own: here,
+                own,
             },
             Failure::Refused(reason) => Self::Refused { resource, reason },
             _ => Self::Lost { resource },

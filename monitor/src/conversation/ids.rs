@@ -63,6 +63,15 @@ index! {
     Name
 }
 
+impl Name {
+    /// Index of a name, and one that is in no table without a name. It needs no branch, because this is how both are
+    /// stored.
+    #[inline]
+    pub(crate) fn index_of(name: Option<Self>) -> usize {
+        name.map_or(u32::MAX, |name| name.0.get()) as usize
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

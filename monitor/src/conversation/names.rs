@@ -106,7 +106,7 @@ impl Names {
     pub(crate) fn is(&self, name: impl Into<Option<Name>>, text: &str) -> bool {
         #[cfg(test)]
         COMPARISONS.with(|count| count.set(count.get() + 1));
-        let entry = name.into().and_then(|name| self.entries.get(name.get()));
+        let entry = self.entries.get(Name::index_of(name.into()));
         entry.is_some_and(|entry| entry.name == text)
     }
 
