@@ -20,7 +20,7 @@ impl<A: MutualExclusion> Locks<A> {
     }
 
     /// Requests a resource, and withdraws the request after one round of messages
-    /// ([`Options::retry`]), or at once if the resource is in use here.
+    /// ([`Options::retry`](crate::Options::retry)), or at once if the resource is in use here.
     pub fn try_lock(&mut self, now: Millis, resource: &Resource, out: &mut Actions) -> ClaimId {
         let busy = self.resources.get(resource).is_some_and(|entry| {
             entry.current.is_some() || !entry.waiting.is_empty() || entry.gate == Gate::Closed

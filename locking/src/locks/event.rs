@@ -72,8 +72,8 @@ pub enum Event {
         /// The resource.
         resource: Resource,
     },
-    /// An owner's epoch has to rise. The caller stores [`OwnerState::raised`], and then calls
-    /// [`Locks::stored`]. The owner grants nothing before.
+    /// An owner's epoch has to rise. The caller stores [`OwnerState::raised`](crate::OwnerState::raised), and then
+    /// calls [`Locks::stored`](crate::Locks::stored). The owner grants nothing before.
     Raised {
         /// The resource.
         resource: Resource,
@@ -105,8 +105,8 @@ pub enum Event {
         /// The reason.
         how: Ending,
     },
-    /// A legacy agent that holds a resource of this owner does not answer. [`Locks::force`] ends its
-    /// grant.
+    /// A legacy agent that holds a resource of this owner does not answer. [`Locks::force`](crate::Locks::force)
+    /// ends its grant.
     Silent {
         /// The resource.
         resource: Resource,

@@ -20,9 +20,9 @@ impl<A: MutualExclusion> Locks<A> {
         self.settle(now, out);
     }
 
-    /// Has the first request of this agent wait for a message of another agent, which the caller has asked for a sign
-    /// of life. It waits for [`Options::retry`] from the first call on at most. Agents that use locks answer,
-    /// and become members.
+    /// Has the first request of this agent wait for a message of another agent, which the caller has asked for a
+    /// sign of life. It waits for [`Options::retry`](crate::Options::retry) from the first call on at most. Agents
+    /// that use locks answer, and become members.
     ///
     /// Only Ricart-Agrawala needs the wait.
     pub fn expect(&mut self, now: Millis, peer: &LockPeer) {

@@ -22,14 +22,15 @@ pub(super) struct Owned {
 impl<A: MutualExclusion> Locks<A> {
     /// Begins to own a resource, with a state that the caller has written and synced.
     ///
-    /// [`Event::Owning`] follows after [`Options::claim`], or [`Event::OwningRefused`] if another agent
-    /// owns the resource. Nothing happens if this agent owns it already.
+    /// [`Event::Owning`] follows after [`Options::claim`](crate::Options::claim), or [`Event::OwningRefused`] if
+    /// another agent owns the resource. Nothing happens if this agent owns it already.
     pub fn own(&mut self, now: Millis, resource: &Resource, state: &OwnerState, out: &mut Actions) {
         self.own_with_lease(now, resource, state, self.options.lease, out);
     }
 
-    /// Begins to own a resource, and grants it with this lease instead of [`Options::lease`]. The state
-    /// has to be for leases of at least this time; see [`own`](Self::own).
+    /// Begins to own a resource, and grants it with this lease instead of
+    /// [`Options::lease`](crate::Options::lease). The state has to be for leases of at least this time; see
+    /// [`own`](Self::own).
     pub fn own_with_lease(
         &mut self,
         now: Millis,

@@ -146,7 +146,7 @@ pub(crate) fn keep_alternatives(
     }
 }
 
-/// The entry of [`Rare::alternatives`](crate::conversation::Rare::alternatives) of a party after an
+/// The entry of [`Rare::alternatives`](crate::conversation::rare::Rare::alternatives) of a party after an
 /// undelivered message: the state before the first known message is unknown, and a message that has ruled
 /// out states has no effect.
 pub(crate) fn any_state_of(party: usize) -> (Option<PartyIndex>, StateId) {

@@ -1,8 +1,8 @@
 //! Conversations, their parts, and the table that has them.
 //!
-//! With [`Scope::Participant`](crate::Scope::Participant), each participant has a [`Party`] with a state of its own. With
-//! [`Scope::Conversation`](crate::Scope::Conversation), there is one party without a participant, and a list of role
-//! bindings.
+//! With [`Scope::Participant`](crate::Scope::Participant), each participant has a [`Party`] with a state of its
+//! own. With [`Scope::Conversation`](crate::Scope::Conversation), there is one party without a participant, and a
+//! list of role bindings.
 //!
 //! The rules that decide on a message do not belong here, but in [`crate::check`].
 

@@ -23,8 +23,8 @@ pub(crate) struct Rare {
     pub(crate) delegates: Vec<(PartyIndex, Name)>,
     /// Whether the conversation may have begun before the monitor.
     pub(crate) may_continue: bool,
-    /// If it may, other states to which the first message to a party may have led: the index of the
-    /// party, or none for the members of a multicast, and the state. [`FAILED`] stands for any
+    /// If it may, other states to which the first message to a party may have led: the index of the party, or none
+    /// for the members of a multicast, and the state. [`FAILED`](crate::conversation::state::FAILED) stands for any
     /// state: a message to the party was not delivered.
     pub(crate) alternatives: Vec<(Option<PartyIndex>, StateId)>,
     /// The conversation as the role of the monitored agent sees it.
@@ -47,7 +47,7 @@ pub(crate) struct Rare {
     pub(crate) asked: SmallVec<[RoleBinding; 2]>,
     /// The last messages of which an observer gets each copy by itself.
     pub(crate) copied: Vec<Copied>,
-    /// The parties by their peers, if there are more than [`FEW`].
+    /// The parties by their peers, if there are more than [`FEW`](crate::conversation::FEW).
     pub(crate) index: HashTable<(Name, PartyIndex)>,
 }
 

@@ -15,7 +15,7 @@ pub(crate) const CANCELLED: StateId = StateId::common(2);
 /// State of every protocol after the message transport service reported a failure.
 pub(crate) const FAILED: StateId = StateId::common(3);
 
-/// State that the monitor does not know: see [`crate::check::delegated`].
+/// State that the monitor does not know: see `check::delegated`.
 pub(crate) const ELSEWHERE: StateId = StateId::common(4);
 
 /// Returns the name of a state.

@@ -155,7 +155,7 @@ impl Monitor {
 
     /// Records that a conversation with this identifier may have begun without the monitor: before it,
     /// or between other agents of which one names the monitored agent in a `reply-to`. A message that
-    /// continues it is then [unchecked](Unchecked::UnknownHistory) instead of a violation.
+    /// continues it is then [unchecked](crate::Unchecked::UnknownHistory) instead of a violation.
     pub fn expect(&mut self, id: &str) {
         self.remember_removed(id);
     }

@@ -80,7 +80,7 @@ pub enum SnapshotError {
 impl Monitor {
     /// Restores the conversations of a [`snapshot`](Self::snapshot) of the same agent, before the first
     /// message. Returns their number, with embedded ones. Conversations of protocols that this monitor does
-    /// not have are left out, and so are the oldest ones if [`MonitorLimits`] are exceeded.
+    /// not have are left out, and so are the oldest ones if [`MonitorLimits`](crate::MonitorLimits) are exceeded.
     ///
     /// # Errors
     /// If the snapshot is malformed, exceeds a limit of this monitor, or is that of another agent; or if

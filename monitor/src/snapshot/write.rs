@@ -21,9 +21,9 @@ impl Monitor {
     /// The snapshot must be the last act of this monitor: the next one refuses a legal message if this one
     /// gets messages, or outcomes of messages, after the snapshot.
     ///
-    /// The snapshot omits conversations with an uncertain state: those that began between other agents,
-    /// that may have begun before the monitor, or whose last message was not delivered; and those of
-    /// protocols with three or more roles. It has at most [`MonitorLimits::bytes`] bytes, and keeps the latest
+    /// The snapshot omits conversations with an uncertain state: those that began between other agents, that may
+    /// have begun before the monitor, or whose last message was not delivered; and those of protocols with three or
+    /// more roles. It has at most [`MonitorLimits::bytes`](crate::MonitorLimits::bytes) bytes, and keeps the latest
     /// conversations. The next monitor does not know the others.
     #[must_use]
     pub fn snapshot(&self, now: impl Into<Moment>) -> Vec<u8> {
