@@ -51,7 +51,7 @@ async fn battery(domain: &Domain) -> fipa::Result<()> {
     let charge = battery.publisher("charge")?;
     let mut percent = 79;
     loop {
-        if charge.publish(percent.to_string()).await > 0 {
+        if charge.publish(percent.to_string()).await.subscribers() > 0 {
             percent -= 1;
         }
         tokio::time::sleep(Duration::from_millis(100)).await;

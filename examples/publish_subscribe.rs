@@ -35,7 +35,7 @@ async fn main() -> fipa::Result<()> {
     }
 
     for percent in [80.5, 80.0, 79.5] {
-        let delivered = charge.publish(percent.to_string()).await;
+        let delivered = charge.publish(percent.to_string()).await.delivered().await;
         println!("{percent} % was delivered to {delivered}");
         for (agent, subscription) in &mut subscriptions {
             let percent: f64 = subscription.next().await?.parse()?;

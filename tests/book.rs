@@ -123,7 +123,7 @@ async fn a_subscriber_is_notified() -> Result<()> {
     let mut subscription = rover.subscribe(subscribe, Duration::from_secs(60)).await?;
 
     // In the process of the battery, at each change:
-    let reached = charge.publish("87").await;
+    let reached = charge.publish("87").await.delivered().await;
 
     // In the process of the rover:
     let notification = subscription.next().await?;

@@ -64,6 +64,8 @@ struct Conversation {
 
 struct Served {
     number: u64,
+    /// Whether all other servers precede it.
+    is_last: bool,
     opens: Opens,
     queue: SetAside,
 }
@@ -256,15 +258,28 @@ impl Demultiplexer {
     /// Starts a queue for the messages that a server handles: those for which `opens` returns true and
     /// that belong to no led conversation.
     pub(crate) fn serve(&self, opens: Opens) -> ReaderKey {
+        self.serve_as(opens, false)
+    }
+
+    /// Starts a queue like [`serve`](Self::serve), for messages that no other server handles.
+    pub(crate) fn serve_last(&self, opens: Opens) -> ReaderKey {
+        self.serve_as(opens, true)
+    }
+
+    fn serve_as(&self, opens: Opens, is_last: bool) -> ReaderKey {
         let mut state = self.state.lock();
         let key = state.key("");
-        let number = key.number;
-        let queue = SetAside::new(&state.full);
-        state.served.push(Served {
-            number,
+        let served = Served {
+            number: key.number,
+            is_last,
             opens,
-            queue,
-        });
+            queue: SetAside::new(&state.full),
+        };
+        let before = state.served.iter().position(|other| other.is_last);
+        match before.filter(|_| !is_last) {
+            Some(before) => state.served.insert(before, served),
+            None => state.served.push(served),
+        }
         key
     }
 

@@ -65,6 +65,8 @@ pub(crate) struct AgentCore {
     pub(crate) endpoint: Endpoint,
     pub(crate) demultiplexer: Demultiplexer,
     pub(crate) locks: LockSlot,
+    #[cfg(feature = "protocols")]
+    pub(crate) topics: crate::protocol::Topics,
     #[cfg(feature = "actions")]
     pub(crate) actions: crate::actions::table::ActionTable,
 }
@@ -154,6 +156,8 @@ impl Domain {
                     endpoint: Endpoint::new(self.clone(), id, name, incarnation),
                     demultiplexer: Demultiplexer::default(),
                     locks: LockSlot::default(),
+                    #[cfg(feature = "protocols")]
+                    topics: crate::protocol::Topics::default(),
                     #[cfg(feature = "actions")]
                     actions: crate::actions::table::ActionTable::default(),
                 });
@@ -333,9 +337,20 @@ impl Agent {
         &self,
         loan: Loan,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
+        self.send_loan_within(loan, self.core.endpoint.domain.inner.deadline)
+    }
+
+    /// Sends the message of a loan with the given deadline instead of the configured one.
+    ///
+    /// # Errors
+    /// See [`send`](Self::send).
+    pub fn send_loan_within(
+        &self,
+        loan: Loan,
+        deadline: Duration,
+    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
         let Loan { draft, content } = loan;
         let (message, letter) = draft.complete(content.freeze());
-        let deadline = self.core.endpoint.domain.inner.deadline;
         let sending = self.core.endpoint.send(&message, Ok(letter), deadline);
         async move { Ok(deliveries(sending?).await) }
     }

@@ -310,6 +310,12 @@ impl Dialogue {
         self.reachability.subscribe()
     }
 
+    /// Takes over the receivers of the reachability of another conversation.
+    pub(super) fn take_reachability(&mut self, other: &mut Self) {
+        std::mem::swap(&mut self.reachability, &mut other.reachability);
+        self.reachability.set(std::iter::empty());
+    }
+
     /// Ends the conversation, except for one last message.
     pub(super) fn take_speaker(&mut self) -> Speaker {
         let core = Arc::clone(self.agent());
@@ -349,6 +355,26 @@ impl Dialogue {
         due: Option<Instant>,
     ) -> Result<Sent, DialogueError> {
         self.speaker.post_within(message, due)
+    }
+
+    /// Sends a message, and waits for the outcome.
+    pub(super) async fn say(&mut self, message: MessageBuilder) -> Result<(), DialogueError> {
+        let sent = self.post(message, None)?;
+        only_delivered(&self.outcomes(sent).await)
+    }
+
+    /// Sends a message like [`post`](Self::post), with this deadline instead of that of the configuration.
+    pub(super) fn post_until(
+        &mut self,
+        message: MessageBuilder,
+        deadline: Option<Duration>,
+    ) -> Result<Sent, DialogueError> {
+        self.speaker.post_until(message, deadline)
+    }
+
+    /// Applies the outcomes of the last message.
+    pub(super) fn settle(&mut self, deliveries: &Deliveries) {
+        self.speaker.settle(deliveries);
     }
 
     /// Answers a message of this conversation, and waits for the outcome.
@@ -586,12 +612,16 @@ impl Speaker {
     /// Waits for the outcomes of the last message. If it was not delivered, it may be sent again.
     pub(super) async fn outcomes(&mut self, sent: Sent) -> Deliveries {
         let deliveries = deliveries(sent).await;
+        self.settle(&deliveries);
+        deliveries
+    }
+
+    fn settle(&mut self, deliveries: &Deliveries) {
         if let Some(last) = &self.last {
-            for receiver in unreached(&deliveries) {
+            for receiver in unreached(deliveries) {
                 self.monitor.undelivered(last, receiver, now());
             }
         }
-        deliveries
     }
 
     /// Sends a message in the protocol of the conversation, without waiting for the outcomes.
@@ -609,9 +639,7 @@ impl Speaker {
         message: MessageBuilder,
         due: Option<Instant>,
     ) -> Result<Sent, DialogueError> {
-        let mut message = message
-            .conversation_id(self.id.as_str())
-            .reply_with(format!("{}--{}", self.id, self.replies + 1));
+        let mut message = message;
         let mut deadline = self.core.endpoint.domain.inner.deadline;
         if let Some(due) = due {
             let left = due.saturating_duration_since(Instant::now());
@@ -621,6 +649,27 @@ impl Speaker {
                 message = message.reply_by(by);
             }
         }
+        self.post_by(message, deadline)
+    }
+
+    fn post_until(
+        &mut self,
+        message: MessageBuilder,
+        deadline: Option<Duration>,
+    ) -> Result<Sent, DialogueError> {
+        let message = message.protocol(self.protocol.as_str());
+        let deadline = deadline.unwrap_or(self.core.endpoint.domain.inner.deadline);
+        self.post_by(message, deadline)
+    }
+
+    fn post_by(
+        &mut self,
+        message: MessageBuilder,
+        deadline: Duration,
+    ) -> Result<Sent, DialogueError> {
+        let message = message
+            .conversation_id(self.id.as_str())
+            .reply_with(format!("{}--{}", self.id, self.replies + 1));
         let message = message.build()?;
         self.check(&Header::from(&message))
             .map_err(CheckFailure::on_sent)?;

@@ -56,6 +56,7 @@ mod reachability;
 mod receivers;
 mod serving;
 mod subscription;
+mod topic;
 mod watching;
 
 pub use auction::Auction;
@@ -68,12 +69,14 @@ pub use participant::{Reply, Task};
 pub use partners::PartnerEvent;
 pub use protocols::Protocols;
 pub use proxied::Proxied;
-pub use publisher::Publisher;
+pub(crate) use publisher::Topics;
+pub use publisher::{NotificationResult, Notified, Publication, Publisher, TopicLoan};
 pub use reachability::{Reachability, Unreachable};
 pub use serving::Server;
 #[cfg(feature = "actions")]
 pub(crate) use serving::serve_those;
-pub use subscription::Subscription;
+pub use subscription::{Notification, Subscription};
+pub use topic::{Keep, KeepError, Topic};
 pub use watching::PartnerWatch;
 
 #[cfg(doc)]

@@ -1,34 +1,49 @@
 //! Publishers: the participant of all subscriptions to one topic.
+//!
+//! Each subscriber has a task and a queue of its own, so a slow one delays no other. One notification is under way to
+//! each; the queue has those that wait. The queue of a subscriber that keeps the newest `n` never has more.
 
-use std::collections::HashMap;
-use std::sync::Arc;
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::fmt;
+use std::pin::Pin;
+use std::sync::{Arc, Weak};
+use std::time::SystemTime;
 
 use bytes::Bytes;
 use fipa_acl::{ErrorChain, Message, Performative, escape_name};
-use fipa_transport::{FailureReason, log_limit};
+use fipa_mts::core::MAX_DEADLINE;
+use fipa_transport::{FailureReason, LoanedContent, Outcome, log_limit};
 use parking_lot::Mutex;
-use tokio::sync::{mpsc, oneshot};
-use tokio::task::{JoinHandle, JoinSet};
+use tokio::sync::{Notify, oneshot};
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
 
 use super::dialogue::{Dialogue, DialogueError, name_of};
 use super::serving::{ServedQueue, opening, refuse};
+use super::topic::{self, Keep, Topic};
+use crate::agent::delivery::{Deliveries, deliveries};
 use crate::agent::incoming::Incoming;
 use crate::agent::{Agent, AgentCore};
+use crate::error::SendError;
 use crate::protocol::peer_shares::PeerPlaces;
 
-/// Maximum number of notifications that wait for one subscriber. Beyond it, `publish` waits.
+/// Maximum number of notifications that wait for one subscriber to all of them. Beyond it, `publish` waits.
 const MAX_WAITING: usize = 64;
 
 /// Maximum number of subscribers of one publisher. One host alone gets a quarter of them. Further ones of a host that has
 /// its share are refused.
 const MAX_SUBSCRIBERS: usize = 4_096;
 
+/// Maximum length in bytes of the list of topics in a refusal.
+const MAX_LISTED: usize = 1_000;
+
 impl Agent {
-    /// Accepts the subscriptions (`subscribe`, FIPA00035) whose content is this topic. One call of
+    /// Publishes a topic: accepts the subscriptions (`subscribe`, FIPA00035) whose content is its name. One call of
     /// [`Publisher::publish`] notifies all subscribers.
     ///
-    /// A subscriber that cancels, leaves or dies is removed. Other messages go to
-    /// [`receive`](Self::receive), as for [`serve`](Self::serve).
+    /// A subscriber that cancels, leaves or dies is removed. A subscription to a topic that no publisher of this agent
+    /// has is refused, with the topics that exist, unless the agent [serves](Self::serve) `fipa-subscribe`. Other
+    /// messages go to [`receive`](Self::receive).
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -46,112 +61,458 @@ impl Agent {
     ///
     /// # Errors
     /// If the protocol library of the configuration has no `fipa-subscribe`.
-    pub fn publisher(&self, topic: impl Into<Bytes>) -> Result<Publisher, DialogueError> {
-        let topic: Bytes = topic.into();
+    pub fn publisher(&self, topic: impl Into<Topic>) -> Result<Publisher, DialogueError> {
+        let topic: Topic = topic.into();
+        let name = topic.name().to_owned();
+        let wanted = name.clone();
         let opens = opening(&self.core, "fipa-subscribe", move |message| {
-            message.content().is_some_and(|content| *content == topic)
+            message.content().is_some_and(|content| *content == wanted)
         })?;
         let runtime = &self.core.endpoint.domain.inner.service.runtime;
-        let subscribers = Arc::new(Subscribers::default());
+        let state = State {
+            is_stream: topic.declared_rate().is_some(),
+            ..State::default()
+        };
+        let shared = Arc::new(Shared {
+            topic,
+            state: Mutex::new(state),
+            room: Notify::new(),
+        });
         let queue = ServedQueue::new(&self.core, opens);
-        let task = runtime.spawn(accept(queue, Arc::clone(&subscribers)));
-        Ok(Publisher { subscribers, task })
+        let task = runtime.spawn(accept(queue, Arc::clone(&shared)));
+        declare(&self.core, name)?;
+        Ok(Publisher {
+            shared,
+            task,
+            core: Arc::clone(&self.core),
+        })
     }
 }
 
 /// Notifies the subscribers to a topic; see [`Agent::publisher`]. Dropping it ends the subscriptions with
 /// `failure`.
-#[derive(Debug)]
 pub struct Publisher {
-    subscribers: Arc<Subscribers>,
+    shared: Arc<Shared>,
     task: JoinHandle<()>,
+    core: Arc<AgentCore>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    topic: Topic,
+    state: Mutex<State>,
+    /// Notified when a full queue has room, and when a subscriber has ended.
+    room: Notify,
 }
 
 #[derive(Debug, Default)]
-struct Subscribers(Mutex<State>);
-
-#[derive(Debug, Default)]
 struct State {
-    all: HashMap<u64, Subscriber>,
-    next: u64,
+    subscribers: HashMap<u64, Subscriber>,
+    last_subscriber: u64,
+    /// The number of the newest sample. The first is 1.
+    last_sample: u64,
+    /// The newest samples, for new subscribers.
+    latched: VecDeque<Sample>,
+    /// Whether subscribers get the newest sample by default.
+    is_stream: bool,
+}
+
+/// A published content.
+#[derive(Debug, Clone)]
+struct Sample {
+    number: u64,
+    content: Bytes,
+    published: SystemTime,
 }
 
 #[derive(Debug)]
 struct Subscriber {
     name: String,
-    notifications: mpsc::Sender<Notification>,
+    keep: Keep,
+    waiting: VecDeque<Waiting>,
+    /// Notified when a sample is added.
+    added: Arc<Notify>,
 }
 
-/// A notification for one subscriber.
+/// A sample that has not been sent to one subscriber.
 #[derive(Debug)]
-struct Notification {
-    content: Bytes,
-    /// Receives whether it was delivered.
-    delivered: oneshot::Sender<bool>,
+struct Waiting {
+    sample: Sample,
+    /// Receives what became of it. `None` for a latched sample.
+    result: Option<oneshot::Sender<NotificationResult>>,
+}
+
+impl Waiting {
+    fn settle(self, result: NotificationResult) {
+        if let Some(sender) = self.result {
+            // The publisher may not wait for it.
+            let _ = sender.send(result);
+        }
+    }
+}
+
+/// A published content on its way to the subscribers; see [`Publisher::publish`]. Dropping it stops no notification.
+#[derive(Debug)]
+pub struct Publication {
+    number: u64,
+    results: Vec<(String, oneshot::Receiver<NotificationResult>)>,
+}
+
+impl Publication {
+    /// Returns its number in the topic, which each notification carries in `X-sample`. The first is 1.
+    #[must_use]
+    pub fn number(&self) -> u64 {
+        self.number
+    }
+
+    /// Returns the number of subscribers at the time of the publication.
+    #[must_use]
+    pub fn subscribers(&self) -> usize {
+        self.results.len()
+    }
+
+    /// Waits until each subscriber has received the notification, or will not.
+    pub async fn results(self) -> Vec<Notified> {
+        let mut all = Vec::with_capacity(self.results.len());
+        for (subscriber, result) in self.results {
+            let result = result.await.unwrap_or(NotificationResult::Ended);
+            all.push(Notified { subscriber, result });
+        }
+        all
+    }
+
+    /// Waits like [`results`](Self::results). Returns the number of subscribers that received the notification.
+    pub async fn delivered(self) -> usize {
+        let results = self.results().await;
+        let received = results.iter().filter(|it| it.result.is_success());
+        received.count()
+    }
+}
+
+/// The result of a notification at one subscriber.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Notified {
+    /// The name of the subscriber.
+    pub subscriber: String,
+    /// The result.
+    pub result: NotificationResult,
+}
+
+/// What became of a notification for one subscriber.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum NotificationResult {
+    /// The notification was sent, and has this outcome.
+    Outcome(Outcome),
+    /// A newer one replaced it before it left, as the subscriber asked.
+    Replaced,
+    /// The subscriber asked for all notifications, and too many wait for it.
+    TooSlow,
+    /// The subscription ended before.
+    Ended,
+}
+
+impl NotificationResult {
+    /// Whether the subscriber received the notification, or a peer that cannot confirm got it.
+    #[must_use]
+    pub fn is_success(&self) -> bool {
+        matches!(self, Self::Outcome(outcome) if outcome.is_success())
+    }
+}
+
+/// Memory for the next content of a topic; see [`Publisher::loan`].
+pub struct TopicLoan(Box<dyn LoanedContent>);
+
+impl TopicLoan {
+    /// Returns the memory of the content, to be written. Its initial bytes are arbitrary.
+    pub fn content_mut(&mut self) -> &mut [u8] {
+        self.0.content_mut()
+    }
+}
+
+impl fmt::Debug for TopicLoan {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("TopicLoan").finish_non_exhaustive()
+    }
 }
 
 impl Publisher {
-    /// Sends a notification (`inform`) to all subscribers, and waits until each has an outcome. Returns
-    /// the number of subscribers to which it was delivered.
+    /// Sends a notification (`inform`) with this content to all subscribers. Returns when it waits for each of them;
+    /// [`Publication::results`] has what became of it.
     ///
-    /// The notifications of several calls arrive in the order of the calls. A subscriber with 64 pending
-    /// notifications delays the call, but not the other subscribers.
-    pub async fn publish(&self, content: impl Into<Bytes>) -> usize {
+    /// The notifications of several calls arrive in the order of the calls. A subscriber that keeps the newest ones
+    /// never delays the call. One that asks for all, or is a partner that cannot ask, and has 64 that wait, delays it
+    /// for at most [`Topic::wait_for_slow`], and does not delay the other subscribers.
+    pub async fn publish(&self, content: impl Into<Bytes>) -> Publication {
         let content: Bytes = content.into();
-        let subscribers: Vec<_> = {
-            let state = self.subscribers.0.lock();
-            let all = state.all.values();
-            all.map(|it| it.notifications.clone()).collect()
+        let content = match self.subscribers() {
+            0 | 1 => content,
+            _ => self
+                .core
+                .endpoint
+                .mts()
+                .shared_content(&content)
+                .unwrap_or(content),
         };
-        let mut sent = JoinSet::new();
-        let mut answers = Vec::new();
-        for subscriber in subscribers {
-            let (delivered, answer) = oneshot::channel();
-            let notification = Notification {
-                content: content.clone(),
-                delivered,
-            };
-            answers.push(answer);
-            match subscriber.try_send(notification) {
-                Ok(()) | Err(mpsc::error::TrySendError::Closed(_)) => {}
-                Err(mpsc::error::TrySendError::Full(notification)) => {
-                    sent.spawn(async move { subscriber.send(notification).await.is_ok() });
-                }
+        self.hand_over(content).await
+    }
+
+    /// Loans memory of `len` bytes for the next content, in shared memory where possible. The application writes the
+    /// content once, and all subscribers on this host read it in place. [`publish_loan`](Self::publish_loan) sends it.
+    ///
+    /// Short content, and content for which no shared memory is free, is on the heap.
+    ///
+    /// # Errors
+    /// If a letter with this content would be larger than the limit ([`SendError::TooLarge`]).
+    pub fn loan(&self, len: usize) -> Result<TopicLoan, SendError> {
+        let limit = self.core.endpoint.domain.inner.max_letter;
+        if len as u64 > limit {
+            return Err(SendError::TooLarge {
+                len: len as u64,
+                limit,
+            });
+        }
+        Ok(TopicLoan(self.core.endpoint.mts().loan_shared(len)))
+    }
+
+    /// Sends the content of a loan like [`publish`](Self::publish). The topic is a stream from then on: subscribers
+    /// get the newest content unless they ask for others ([`Keep::Auto`]).
+    pub async fn publish_loan(&self, loan: TopicLoan) -> Publication {
+        self.shared.state.lock().is_stream = true;
+        self.hand_over(loan.0.freeze()).await
+    }
+
+    async fn hand_over(&self, content: Bytes) -> Publication {
+        let until = Instant::now() + self.shared.topic.wait();
+        loop {
+            // Created before the check, so that no room after the check is missed.
+            let room = self.shared.room.notified();
+            if self.shared.state.lock().has_room() || Instant::now() >= until {
+                break;
             }
+            let _ = tokio::time::timeout_at(until, room).await;
         }
-        while sent.join_next().await.is_some() {}
-        let mut count = 0;
-        for answer in answers {
-            count += usize::from(answer.await.unwrap_or(false));
-        }
-        count
+        self.shared.add(content)
     }
 
     /// Returns the number of subscribers.
     #[must_use]
     pub fn subscribers(&self) -> usize {
-        self.subscribers.0.lock().all.len()
+        self.shared.state.lock().subscribers.len()
     }
 
     /// Returns the names of the subscribers, sorted.
     #[must_use]
     pub fn names(&self) -> Vec<String> {
-        let state = self.subscribers.0.lock();
-        let mut names: Vec<String> = state.all.values().map(|it| it.name.clone()).collect();
+        let state = self.shared.state.lock();
+        let names = state.subscribers.values().map(|it| it.name.clone());
+        let mut names: Vec<String> = names.collect();
         names.sort_unstable();
         names
+    }
+}
+
+impl fmt::Debug for Publisher {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Publisher")
+            .field("topic", &self.shared.topic)
+            .field("subscribers", &self.subscribers())
+            .finish_non_exhaustive()
     }
 }
 
 impl Drop for Publisher {
     fn drop(&mut self) {
         self.task.abort();
-        self.subscribers.0.lock().all.clear();
+        undeclare(&self.core, self.shared.topic.name());
+        let subscribers = std::mem::take(&mut self.shared.state.lock().subscribers);
+        for subscriber in subscribers.into_values() {
+            subscriber.added.notify_one();
+        }
+    }
+}
+
+impl Shared {
+    /// Adds a sample to the queues of all subscribers.
+    fn add(&self, content: Bytes) -> Publication {
+        let mut state = self.state.lock();
+        state.last_sample += 1;
+        let sample = Sample {
+            number: state.last_sample,
+            content,
+            published: SystemTime::now(),
+        };
+        if self.topic.kept() > 0 {
+            state.latched.push_back(sample.clone());
+            while state.latched.len() > self.topic.kept() {
+                state.latched.pop_front();
+            }
+        }
+        let is_stream = state.is_stream;
+        let mut results = Vec::with_capacity(state.subscribers.len());
+        for subscriber in state.subscribers.values_mut() {
+            let (sender, result) = oneshot::channel();
+            results.push((subscriber.name.clone(), result));
+            let waiting = Waiting {
+                sample: sample.clone(),
+                result: Some(sender),
+            };
+            subscriber.add(waiting, is_stream);
+        }
+        Publication {
+            number: sample.number,
+            results,
+        }
+    }
+
+    /// Adds a subscriber, which gets the latched samples.
+    fn register(&self, name: String, keep: Keep) -> (u64, Arc<Notify>) {
+        let mut state = self.state.lock();
+        state.last_subscriber += 1;
+        let number = state.last_subscriber;
+        let mut subscriber = Subscriber {
+            name,
+            keep,
+            waiting: VecDeque::new(),
+            added: Arc::default(),
+        };
+        for sample in &state.latched {
+            let sample = sample.clone();
+            let waiting = Waiting {
+                sample,
+                result: None,
+            };
+            subscriber.add(waiting, state.is_stream);
+        }
+        let added = Arc::clone(&subscriber.added);
+        state.subscribers.insert(number, subscriber);
+        (number, added)
+    }
+
+    /// Takes the next sample for a subscriber. `None` if the publisher has ended.
+    fn take(&self, number: u64) -> Option<Option<(Waiting, Keep)>> {
+        let mut state = self.state.lock();
+        let is_stream = state.is_stream;
+        let subscriber = state.subscribers.get_mut(&number)?;
+        let was_full = subscriber.is_full(is_stream);
+        let next = subscriber.waiting.pop_front();
+        let keep = match subscriber.keep.bound(is_stream) {
+            None => Keep::All,
+            Some(n) => Keep::latest(u32::try_from(n).unwrap_or(u32::MAX)),
+        };
+        drop(state);
+        if was_full {
+            self.room.notify_waiters();
+        }
+        Some(next.map(|waiting| (waiting, keep)))
+    }
+
+    fn remove(&self, number: u64) {
+        drop(self.state.lock().subscribers.remove(&number));
+        self.room.notify_waiters();
+    }
+}
+
+impl State {
+    /// Whether the next sample has room in each queue.
+    fn has_room(&self) -> bool {
+        let mut subscribers = self.subscribers.values();
+        !subscribers.any(|it| it.is_full(self.is_stream))
+    }
+}
+
+impl Subscriber {
+    /// Whether it is to get all samples, and as many wait as may.
+    fn is_full(&self, is_stream: bool) -> bool {
+        self.keep.bound(is_stream).is_none() && self.waiting.len() >= MAX_WAITING
+    }
+
+    fn add(&mut self, waiting: Waiting, is_stream: bool) {
+        if self.is_full(is_stream) {
+            return waiting.settle(NotificationResult::TooSlow);
+        }
+        self.waiting.push_back(waiting);
+        if let Some(most) = self.keep.bound(is_stream) {
+            while self.waiting.len() > most {
+                if let Some(oldest) = self.waiting.pop_front() {
+                    oldest.settle(NotificationResult::Replaced);
+                }
+            }
+        }
+        self.added.notify_one();
+    }
+}
+
+/// The topics of an agent, with the number of publishers of each, and the task that refuses others.
+#[derive(Debug, Default)]
+pub(crate) struct Topics(Mutex<Declared>);
+
+#[derive(Debug, Default)]
+struct Declared {
+    topics: BTreeMap<String, usize>,
+    refusing: Option<JoinHandle<()>>,
+}
+
+impl Drop for Declared {
+    fn drop(&mut self) {
+        if let Some(refusing) = &self.refusing {
+            refusing.abort();
+        }
+    }
+}
+
+impl Topics {
+    fn refusal(&self) -> String {
+        let mut text = "there is no such topic; topics:".to_owned();
+        for topic in self.0.lock().topics.keys() {
+            if text.len() + topic.len() > MAX_LISTED {
+                text += " ...";
+                break;
+            }
+            text = text + " " + topic;
+        }
+        text
+    }
+}
+
+/// Has an agent refuse subscriptions to other topics than its own.
+fn declare(core: &Arc<AgentCore>, topic: String) -> Result<(), DialogueError> {
+    let is_first = {
+        let mut declared = core.topics.0.lock();
+        *declared.topics.entry(topic).or_default() += 1;
+        declared.refusing.is_none()
+    };
+    if !is_first {
+        return Ok(());
+    }
+    let agent = Arc::downgrade(core);
+    let opens = opening(core, "fipa-subscribe", move |_| {
+        let core = agent.upgrade();
+        core.is_some_and(|core| !core.topics.0.lock().topics.is_empty())
+    })?;
+    let queue = ServedQueue::last(core, opens);
+    let runtime = &core.endpoint.domain.inner.service.runtime;
+    let refusing = runtime.spawn(async move {
+        while let Some(first) = queue.next().await {
+            refuse(queue.agent(), &first, &queue.agent().topics.refusal());
+        }
+    });
+    core.topics.0.lock().refusing = Some(refusing);
+    Ok(())
+}
+
+fn undeclare(core: &AgentCore, topic: &str) {
+    let mut declared = core.topics.0.lock();
+    if let Some(count) = declared.topics.get_mut(topic) {
+        *count -= 1;
+        if *count == 0 {
+            declared.topics.remove(topic);
+        }
     }
 }
 
 /// Accepts subscriptions until the agent ends.
-async fn accept(queue: ServedQueue, subscribers: Arc<Subscribers>) {
+async fn accept(queue: ServedQueue, shared: Arc<Shared>) {
     let places = PeerPlaces::new(MAX_SUBSCRIBERS);
     while let Some(first) = queue.next().await {
         let core = Arc::clone(queue.agent());
@@ -159,10 +520,10 @@ async fn accept(queue: ServedQueue, subscribers: Arc<Subscribers>) {
             refuse(&core, &first, "too many subscribers");
             continue;
         };
-        let subscribers = Arc::downgrade(&subscribers);
+        let shared = Arc::downgrade(&shared);
         tokio::spawn(async move {
             let name = name_of(first.message());
-            let served = serve(&core, &first, &subscribers).await;
+            let served = serve(&core, &first, &shared).await;
             drop(place);
             if let Err(error) = served {
                 log_limit::info!(of: &*name, subscriber = %escape_name(&name), error = %ErrorChain(&error), "a subscription has ended");
@@ -175,37 +536,32 @@ async fn accept(queue: ServedQueue, subscribers: Arc<Subscribers>) {
 async fn serve(
     core: &Arc<AgentCore>,
     first: &Incoming,
-    subscribers: &std::sync::Weak<Subscribers>,
+    shared: &Weak<Shared>,
 ) -> Result<(), DialogueError> {
     let mut dialogue = Dialogue::join(core, first)?;
     let first = first.message();
-    let (sender, mut notifications) = mpsc::channel(MAX_WAITING);
-    let Some(registered) = subscribers.upgrade() else {
+    let Some(registered) = shared.upgrade() else {
         return dialogue
             .answer(first, Performative::Refuse, ENDED, None)
             .await;
     };
+    let asked = Keep::of(first);
     // Registered before the `agree`: the subscriber gets each notification that is published after it has
     // received the `agree`.
-    let number = {
-        let mut state = registered.0.lock();
-        state.next += 1;
-        let number = state.next;
-        let subscriber = Subscriber {
-            name: name_of(first),
-            notifications: sender,
-        };
-        state.all.insert(number, subscriber);
-        number
-    };
+    let (number, added) = registered.register(name_of(first), asked.unwrap_or(Keep::All));
     drop(registered);
-    let agreed = dialogue.answer(first, Performative::Agree, "", None).await;
-    let served = match agreed {
-        Ok(()) => notify(&mut dialogue, first, &mut notifications).await,
+    let agree = core.endpoint.reply(first, Performative::Agree).content("");
+    let agree = match asked {
+        // Shows a partner that its wish is known.
+        Some(keep) => agree.user_defined(topic::DELIVERY, keep.to_string()),
+        None => agree,
+    };
+    let served = match dialogue.say(agree).await {
+        Ok(()) => notify(&mut dialogue, first, shared, number, &added).await,
         Err(error) => Err(error),
     };
-    if let Some(subscribers) = subscribers.upgrade() {
-        subscribers.0.lock().all.remove(&number);
+    if let Some(shared) = shared.upgrade() {
+        shared.remove(number);
     }
     served
 }
@@ -213,12 +569,25 @@ async fn serve(
 /// The content of the `failure`, or of the `refuse`, at the end of a publisher.
 const ENDED: &str = "the publisher has ended";
 
+/// A notification that was sent.
+struct UnderWay {
+    outcomes: Pin<Box<dyn Future<Output = Deliveries> + Send>>,
+    result: Option<oneshot::Sender<NotificationResult>>,
+}
+
 async fn notify(
     dialogue: &mut Dialogue,
     first: &Message,
-    notifications: &mut mpsc::Receiver<Notification>,
+    shared: &Weak<Shared>,
+    number: u64,
+    added: &Notify,
 ) -> Result<(), DialogueError> {
+    let mut under_way: Option<UnderWay> = None;
     loop {
+        let (outcomes, is_free) = match &mut under_way {
+            Some(sent) => (Some(&mut sent.outcomes), false),
+            None => (None, true),
+        };
         tokio::select! {
             // A cancel precedes the notifications that wait.
             biased;
@@ -231,21 +600,79 @@ async fn notify(
                 Ok(_) | Err(DialogueError::Violation { .. } | DialogueError::Undelivered(_)) => {}
                 Err(error) => return Err(error),
             },
-            notification = notifications.recv() => {
-                let Some(Notification { content, delivered }) = notification else {
+            deliveries = finished(outcomes) => {
+                dialogue.settle(&deliveries);
+                let result = under_way.take().and_then(|sent| sent.result);
+                let Some(delivery) = deliveries.0.into_iter().next() else {
+                    continue;
+                };
+                let is_gone = matches!(
+                    delivery.outcome,
+                    Outcome::Failed { reason: FailureReason::NoSuchAgent, .. }
+                );
+                if let Some(result) = result {
+                    // The publisher may not wait for it.
+                    let _ = result.send(NotificationResult::Outcome(delivery.outcome));
+                }
+                if is_gone {
+                    let agent = delivery.receiver.to_string();
+                    return Err(DialogueError::Gone { agent });
+                }
+            }
+            next = next_sample(shared, number, added), if is_free => {
+                let Some((waiting, keep)) = next else {
                     dialogue.take_speaker().abandon(first, ENDED);
                     return Ok(());
                 };
-                let sent = dialogue.answer(first, Performative::Inform, content, None).await;
-                // The publisher may have stopped waiting.
-                let _ = delivered.send(sent.is_ok());
-                match sent {
-                    Ok(()) => {}
-                    Err(DialogueError::NotDelivered { reason, .. })
-                        if reason != FailureReason::NoSuchAgent => {}
-                    Err(error) => return Err(error),
-                }
+                under_way = Some(send(dialogue, first, waiting, keep)?);
             }
         }
     }
+}
+
+/// Waits for the outcomes of the notification that is under way.
+async fn finished(
+    outcomes: Option<&mut Pin<Box<dyn Future<Output = Deliveries> + Send>>>,
+) -> Deliveries {
+    match outcomes {
+        Some(outcomes) => outcomes.await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Waits for the next sample. `None` if the publisher has ended.
+async fn next_sample(
+    shared: &Weak<Shared>,
+    number: u64,
+    added: &Notify,
+) -> Option<(Waiting, Keep)> {
+    loop {
+        if let Some(next) = shared.upgrade()?.take(number)? {
+            return Some(next);
+        }
+        added.notified().await;
+    }
+}
+
+fn send(
+    dialogue: &mut Dialogue,
+    first: &Message,
+    waiting: Waiting,
+    keep: Keep,
+) -> Result<UnderWay, DialogueError> {
+    let Waiting { sample, result } = waiting;
+    let notification = dialogue.agent().endpoint.reply(first, Performative::Inform);
+    let notification = notification.content(sample.content);
+    let notification = topic::marked(notification, sample.number, sample.published, keep);
+    // With a short deadline, each end of it would leave one more outdated content in the queue of a subscriber that
+    // is stopped.
+    let deadline = match keep {
+        Keep::Latest(_) => Some(MAX_DEADLINE),
+        _ => None,
+    };
+    let sent = dialogue.post_until(notification, deadline)?;
+    Ok(UnderWay {
+        outcomes: Box::pin(deliveries(sent)),
+        result,
+    })
 }

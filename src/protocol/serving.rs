@@ -123,6 +123,14 @@ impl ServedQueue {
         }
     }
 
+    /// Starts a queue for the messages that no other server handles.
+    pub(super) fn last(core: &Arc<AgentCore>, opens: Opens) -> Self {
+        Self {
+            key: core.demultiplexer.serve_last(opens),
+            core: Arc::clone(core),
+        }
+    }
+
     pub(super) fn agent(&self) -> &Arc<AgentCore> {
         &self.core
     }

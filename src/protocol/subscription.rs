@@ -1,40 +1,64 @@
-//! Subscriptions (FIPA00035).
+//! Subscriptions (FIPA00035), and the topics of publishers.
+//!
+//! A publisher of this project answers the wish of [`Keep`]. A task then reads its notifications, keeps as many as the
+//! subscriber asked for, and subscribes again when the publisher has ended and returns. Another partner's notifications
+//! stay in the agent's queue until the program reads them.
 
+use std::collections::VecDeque;
 use std::fmt;
+use std::ops::Deref;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
+use fipa_sds::Change;
 use futures_core::Stream;
-use tokio::sync::Mutex;
+use tokio::sync::{Mutex, Notify};
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
 
 use super::dialogue::{Dialogue, DialogueError, after, only_delivered};
 use super::reachability::Reachability;
 use super::receivers::single;
+use super::topic::{self, Keep};
 use crate::agent::{Agent, AgentCore};
+
+/// Maximum number of notifications that are read before the program asks for them, of a subscription to all.
+const READ_AHEAD: usize = 64;
+
+/// Maximum number of errors that are kept until the program asks for them.
+const MAX_ERRORS: usize = 16;
+
+/// Minimum and maximum time between two attempts to subscribe again.
+const AGAIN_FIRST: Duration = Duration::from_secs(1);
+const AGAIN_LAST: Duration = Duration::from_secs(30);
+
+/// Number of notifications of which the rate is that of a subscription.
+const RATED: usize = 32;
 
 impl Agent {
     /// Subscribes to the notifications of an agent (`subscribe`, FIPA00035). Waits until the agent
     /// agrees or sends the first notification.
     ///
+    /// If the agent publishes the topic with a [`Publisher`](super::Publisher), the subscriber gets the newest
+    /// notification of a stream and all of others ([`Keep::Auto`]); [`subscribe_keeping`](Self::subscribe_keeping) asks
+    /// for something else.
+    ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
     /// use std::time::Duration;
+    /// use fipa::Performative;
     /// use fipa::protocol::DialogueError;
-    /// use fipa::{AgentId, Performative};
     ///
-    /// let subscribe = agent
-    ///     .message(Performative::Subscribe)
-    ///     .receiver(AgentId::new("battery")?)
-    ///     .content("charge");
+    /// let subscribe = agent.message(Performative::Subscribe).receiver("battery").content("charge");
     /// let mut charge = agent.subscribe(subscribe, Duration::from_secs(5)).await?;
     /// loop {
     ///     match charge.next().await {
-    ///         Ok(notification) => println!("{notification}"),
-    ///         // The subscription goes on when the host returns.
-    ///         Err(silent @ DialogueError::Unreachable { .. }) => println!("{silent}"),
+    ///         Ok(notification) => println!("{notification}, {} missed", notification.missed()),
+    ///         // The subscription goes on when the host or the publisher returns.
+    ///         Err(error) if charge.goes_on() => println!("{error}"),
     ///         Err(error) => return Err(error.into()),
     ///     }
     /// }
@@ -49,7 +73,88 @@ impl Agent {
         subscribe: MessageBuilder,
         timeout: Duration,
     ) -> Result<Subscription, DialogueError> {
+        self.subscribe_keeping(Keep::Auto, subscribe, timeout).await
+    }
+
+    /// Subscribes like [`subscribe`](Self::subscribe), and asks for these notifications.
+    ///
+    /// # Errors
+    /// See [`subscribe`](Self::subscribe).
+    pub async fn subscribe_keeping(
+        &self,
+        keep: Keep,
+        subscribe: MessageBuilder,
+        timeout: Duration,
+    ) -> Result<Subscription, DialogueError> {
+        let subscribe = subscribe.user_defined(topic::DELIVERY, keep.to_string());
         Subscription::begin(&self.core, subscribe, timeout).await
+    }
+}
+
+/// A notification of a subscription. It is also the message.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Notification {
+    message: Message,
+    missed: u64,
+    restarted: bool,
+}
+
+impl Notification {
+    /// Returns the message (`inform`).
+    #[must_use]
+    pub fn message(&self) -> &Message {
+        &self.message
+    }
+
+    /// Returns the message.
+    #[must_use]
+    pub fn into_message(self) -> Message {
+        self.message
+    }
+
+    /// Returns the number of notifications between the previous one and this one that the subscription did not get,
+    /// because newer ones replaced them or they failed. 0 if the publisher does not number them.
+    #[must_use]
+    pub fn missed(&self) -> u64 {
+        self.missed
+    }
+
+    /// Whether it is the first one after the publisher ended and returned. How many were missed is unknown then.
+    #[must_use]
+    pub fn is_restart(&self) -> bool {
+        self.restarted
+    }
+
+    /// Returns its number in the topic. `None` if the publisher does not number its notifications.
+    #[must_use]
+    pub fn number(&self) -> Option<u64> {
+        topic::number_of(&self.message)
+    }
+
+    /// Returns the time since the publication, by the clocks of both hosts. `None` if the publisher does not say when
+    /// it was.
+    #[must_use]
+    pub fn age(&self) -> Option<Duration> {
+        let published = topic::published_at(&self.message)?;
+        Some(
+            SystemTime::now()
+                .duration_since(published)
+                .unwrap_or_default(),
+        )
+    }
+}
+
+impl fmt::Display for Notification {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.message.fmt(f)
+    }
+}
+
+impl Deref for Notification {
+    type Target = Message;
+
+    fn deref(&self) -> &Message {
+        &self.message
     }
 }
 
@@ -57,20 +162,190 @@ impl Agent {
 ///
 /// It does not borrow the agent. It is also a [`Stream`], which ends after an error that ends the
 /// subscription.
+///
+/// If the publisher ends, for example with its host, a subscription to a topic of this project goes on: it returns the
+/// error once, subscribes again when the publisher returns, at most once a second, and marks the next notification as
+/// [restart](Notification::is_restart).
 #[must_use = "next() returns the notifications"]
 pub struct Subscription {
     id: String,
     reachability: Reachability,
     dialogue: Arc<Mutex<Dialogue>>,
+    /// The notifications that a task reads, and that task. `None` if the partner does not know topics.
+    reader: Option<Reader>,
     /// The wait of the stream for the next notification.
     waiting: Option<Waiting>,
-    /// Whether the stream has returned the error that ended the subscription.
+    /// Whether an error has ended the subscription.
     is_over: bool,
     receivers: Vec<AgentId>,
     early: Option<Message>,
+    /// The numbers and the times of the last notifications.
+    last: VecDeque<(u64, SystemTime)>,
 }
 
-type Waiting = Pin<Box<dyn Future<Output = Result<Message, DialogueError>> + Send>>;
+type Waiting = Pin<Box<dyn Future<Output = Result<Received, DialogueError>> + Send>>;
+
+/// A notification that was read.
+#[derive(Debug)]
+struct Received {
+    message: Message,
+    restarted: bool,
+}
+
+/// The task that reads the notifications of a topic.
+struct Reader {
+    queue: Arc<Queue>,
+    task: JoinHandle<()>,
+}
+
+impl Drop for Reader {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+/// The notifications that were read and not returned.
+#[derive(Debug, Default)]
+struct Queue {
+    state: parking_lot::Mutex<QueueState>,
+    /// Notified when an item is added, and at the end.
+    added: Notify,
+    /// Notified when an item is taken.
+    room: Notify,
+}
+
+#[derive(Debug, Default)]
+struct QueueState {
+    items: VecDeque<Result<Received, DialogueError>>,
+    notifications: usize,
+    errors: usize,
+    /// Number of notifications that are kept; `None` for all.
+    keep: Option<usize>,
+    /// Whether the next notification is the first of a publisher that has returned.
+    restarted: bool,
+}
+
+impl Queue {
+    fn notification(&self, message: Message) {
+        let mut state = self.state.lock();
+        if let Some(keep) = Keep::of(&message) {
+            state.keep = keep.bound(false);
+        }
+        let restarted = std::mem::take(&mut state.restarted);
+        state.items.push_back(Ok(Received { message, restarted }));
+        state.notifications += 1;
+        while state.keep.is_some_and(|keep| state.notifications > keep) {
+            state.replace_oldest();
+        }
+        drop(state);
+        self.added.notify_one();
+    }
+
+    fn error(&self, error: DialogueError) {
+        let mut state = self.state.lock();
+        if state.errors < MAX_ERRORS {
+            state.items.push_back(Err(error));
+            state.errors += 1;
+        }
+        drop(state);
+        self.added.notify_one();
+    }
+
+    /// Waits until a further notification may be read.
+    async fn has_room(&self) {
+        loop {
+            // Created before the check, so that no room after the check is missed.
+            let room = self.room.notified();
+            {
+                let state = self.state.lock();
+                if state.keep.is_some() || state.notifications < READ_AHEAD {
+                    return;
+                }
+            }
+            room.await;
+        }
+    }
+
+    async fn next(&self) -> Result<Received, DialogueError> {
+        loop {
+            let added = self.added.notified();
+            if let Some(item) = self.state.lock().take() {
+                self.room.notify_one();
+                return item;
+            }
+            added.await;
+        }
+    }
+}
+
+impl QueueState {
+    fn take(&mut self) -> Option<Result<Received, DialogueError>> {
+        let item = self.items.pop_front()?;
+        match &item {
+            Ok(_) => self.notifications -= 1,
+            Err(_) => self.errors -= 1,
+        }
+        Some(item)
+    }
+
+    /// Removes the oldest notification. That it was the first after a restart passes on to the next one.
+    fn replace_oldest(&mut self) {
+        let Some(at) = self.items.iter().position(Result::is_ok) else {
+            return;
+        };
+        let oldest = self.items.remove(at);
+        self.notifications -= 1;
+        let restarted = matches!(
+            oldest,
+            Some(Ok(Received {
+                restarted: true,
+                ..
+            }))
+        );
+        let next = self.items.iter_mut().flatten().next();
+        if let Some(next) = next.filter(|_| restarted) {
+            next.restarted = true;
+        }
+    }
+}
+
+/// A conversation that a partner has accepted.
+struct Begun {
+    dialogue: Dialogue,
+    receivers: Vec<AgentId>,
+    /// What the partner answered to the wish; `None` if it does not know topics.
+    keep: Option<Keep>,
+    early: Option<Message>,
+}
+
+async fn begin(
+    core: &Arc<AgentCore>,
+    subscribe: MessageBuilder,
+    timeout: Duration,
+) -> Result<Begun, DialogueError> {
+    let due = after(timeout);
+    let (subscribe, receivers) = single(core, subscribe)?;
+    let opened = Dialogue::open(core, "fipa-subscribe", subscribe, due);
+    let (mut dialogue, sent) = opened.await?;
+    only_delivered(&sent)?;
+    let first = dialogue.receive(due).await?.message;
+    let mut keep = None;
+    let early = match first.performative() {
+        Performative::Agree => {
+            keep = Keep::of(&first);
+            None
+        }
+        Performative::Refuse => return Err(DialogueError::Refused(Box::new(first))),
+        Performative::Failure => return Err(DialogueError::Failed(Box::new(first))),
+        _ => Some(first),
+    };
+    Ok(Begun {
+        dialogue,
+        receivers,
+        keep,
+        early,
+    })
+}
 
 impl Subscription {
     pub(crate) async fn begin(
@@ -78,30 +353,43 @@ impl Subscription {
         subscribe: MessageBuilder,
         timeout: Duration,
     ) -> Result<Self, DialogueError> {
-        let due = after(timeout);
-        let (subscribe, receivers) = single(core, subscribe)?;
-        let opened = Dialogue::open(core, "fipa-subscribe", subscribe, due);
-        let (mut dialogue, sent) = opened.await?;
-        only_delivered(&sent)?;
-        let first = dialogue.receive(due).await?.message;
-        let early = match first.performative() {
-            Performative::Agree => None,
-            Performative::Refuse => return Err(DialogueError::Refused(Box::new(first))),
-            Performative::Failure => return Err(DialogueError::Failed(Box::new(first))),
-            _ => Some(first),
-        };
+        let begun = begin(core, subscribe.clone(), timeout).await?;
+        let Begun {
+            dialogue,
+            receivers,
+            keep,
+            early,
+        } = begun;
+        let (id, reachability) = (dialogue.id().to_owned(), dialogue.reachability());
+        let dialogue = Arc::new(Mutex::new(dialogue));
+        let reader = keep.map(|keep| {
+            let queue = Arc::new(Queue::default());
+            queue.state.lock().keep = keep.bound(false);
+            let reading = Reading {
+                core: Arc::clone(core),
+                subscribe,
+                timeout,
+                dialogue: Arc::clone(&dialogue),
+                queue: Arc::clone(&queue),
+            };
+            let runtime = &core.endpoint.domain.inner.service.runtime;
+            let task = runtime.spawn(reading.run());
+            Reader { queue, task }
+        });
         Ok(Self {
-            id: dialogue.id().to_owned(),
-            reachability: dialogue.reachability(),
-            dialogue: Arc::new(Mutex::new(dialogue)),
+            id,
+            reachability,
+            dialogue,
+            reader,
             waiting: None,
             is_over: false,
             receivers,
             early,
+            last: VecDeque::new(),
         })
     }
 
-    /// Returns the conversation id.
+    /// Returns the conversation id of the first conversation with the publisher.
     #[must_use]
     pub fn conversation_id(&self) -> &str {
         &self.id
@@ -113,20 +401,103 @@ impl Subscription {
         self.reachability.clone()
     }
 
+    /// Returns the notifications per second, by the numbers and times of the last ones that [`next`](Self::next)
+    /// returned. `None` before the second one, and if the publisher does not number them.
+    #[must_use]
+    pub fn rate(&self) -> Option<f64> {
+        let ((first, from), (last, to)) = (self.last.front()?, self.last.back()?);
+        let span = to
+            .duration_since(*from)
+            .ok()
+            .filter(|span| !span.is_zero())?;
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "a rate of this many notifications needs no exact number"
+        )]
+        let count = last.checked_sub(*first).filter(|count| *count > 0)? as f64;
+        Some(count / span.as_secs_f64())
+    }
+
+    /// Whether further notifications can follow. After an error that ends the subscription, none does.
+    #[must_use]
+    pub fn goes_on(&self) -> bool {
+        !self.is_over
+    }
+
     /// Waits for the next notification (`inform`), without a time limit. Dropping the future loses no
     /// notification.
     ///
     /// # Errors
     /// If the other side ends the subscription with `failure` or violates the protocol, or if the agent
     /// is gone ([`DialogueError::Gone`]). [`DialogueError::Unreachable`] is returned once when the host
-    /// of the agent becomes silent; the subscription goes on, and later calls wait again.
-    pub async fn next(&mut self) -> Result<Message, DialogueError> {
+    /// of the agent becomes silent. [`goes_on`](Self::goes_on) is then true if later calls wait again.
+    pub async fn next(&mut self) -> Result<Notification, DialogueError> {
         // Dropping the wait of the stream loses no message.
         self.waiting = None;
-        match self.early.take() {
-            Some(early) => Ok(early),
-            None => wait(Arc::clone(&self.dialogue)).await,
+        let received = match self.early.take() {
+            Some(message) => Ok(Received {
+                message,
+                restarted: false,
+            }),
+            None => self.wait().await,
+        };
+        self.returned(received)
+    }
+
+    /// Waits for the next notification that was not returned.
+    fn wait(&self) -> Waiting {
+        match &self.reader {
+            Some(reader) => {
+                let queue = Arc::clone(&reader.queue);
+                Box::pin(async move { queue.next().await })
+            }
+            None => {
+                let dialogue = Arc::clone(&self.dialogue);
+                Box::pin(async move {
+                    let message = read(&dialogue).await?;
+                    Ok(Received {
+                        message,
+                        restarted: false,
+                    })
+                })
+            }
         }
+    }
+
+    /// Counts what was missed.
+    fn returned(
+        &mut self,
+        received: Result<Received, DialogueError>,
+    ) -> Result<Notification, DialogueError> {
+        let Received { message, restarted } = match received {
+            Ok(received) => received,
+            Err(error) => {
+                self.is_over = !match self.reader {
+                    Some(_) => can_return(&error) || goes_on(&error),
+                    None => goes_on(&error),
+                };
+                return Err(error);
+            }
+        };
+        let mut missed = 0;
+        if let Some(number) = topic::number_of(&message) {
+            if restarted {
+                self.last.clear();
+            }
+            if let Some((last, _)) = self.last.back() {
+                missed = number.saturating_sub(*last).saturating_sub(1);
+            }
+            let published = topic::published_at(&message).unwrap_or_else(SystemTime::now);
+            self.last.push_back((number, published));
+            while self.last.len() > RATED {
+                self.last.pop_front();
+            }
+        }
+        Ok(Notification {
+            message,
+            missed,
+            restarted,
+        })
     }
 
     /// Cancels the subscription and waits for the confirmation of the other side.
@@ -136,12 +507,15 @@ impl Subscription {
     /// answer within `timeout`.
     pub async fn cancel(mut self, timeout: Duration) -> Result<(), DialogueError> {
         self.waiting = None;
+        // Its task reads no longer.
+        self.reader = None;
         let mut dialogue = self.dialogue.lock().await;
         dialogue.cancel(self.receivers, after(timeout)).await
     }
 }
 
-async fn wait(dialogue: Arc<Mutex<Dialogue>>) -> Result<Message, DialogueError> {
+/// Waits for the next message of the other side. A `failure` is an error.
+async fn read(dialogue: &Mutex<Dialogue>) -> Result<Message, DialogueError> {
     let message = dialogue.lock().await.receive_or_silence().await?.message;
     match message.performative() {
         Performative::Failure => Err(DialogueError::Failed(Box::new(message))),
@@ -149,31 +523,110 @@ async fn wait(dialogue: Arc<Mutex<Dialogue>>) -> Result<Message, DialogueError> 
     }
 }
 
+/// The task of a subscription to a topic.
+struct Reading {
+    core: Arc<AgentCore>,
+    subscribe: MessageBuilder,
+    timeout: Duration,
+    dialogue: Arc<Mutex<Dialogue>>,
+    queue: Arc<Queue>,
+}
+
+impl Reading {
+    async fn run(self) {
+        loop {
+            self.queue.has_room().await;
+            match read(&self.dialogue).await {
+                Ok(message) => self.queue.notification(message),
+                Err(error) => {
+                    let (is_gone, goes_on) = (can_return(&error), goes_on(&error));
+                    self.queue.error(error);
+                    if is_gone {
+                        self.begin_again().await;
+                    } else if !goes_on {
+                        return;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Subscribes again until the publisher agrees.
+    async fn begin_again(&self) {
+        let mut changes = self.core.endpoint.domain.directory().watch();
+        let mut pause = AGAIN_FIRST;
+        loop {
+            // At most one attempt a second, and one at once when the publisher is registered again.
+            let (earliest, latest) = (Instant::now() + AGAIN_FIRST, Instant::now() + pause);
+            loop {
+                tokio::select! {
+                    () = tokio::time::sleep_until(latest) => break,
+                    change = changes.next() => match change {
+                        Some(Change::Joined(entry)) if self.is_publisher(&entry.name) => {
+                            tokio::time::sleep_until(earliest).await;
+                            break;
+                        }
+                        Some(_) => {}
+                        None => tokio::time::sleep_until(latest).await,
+                    },
+                }
+            }
+            pause = (pause * 2).min(AGAIN_LAST);
+            match begin(&self.core, self.subscribe.clone(), self.timeout).await {
+                Ok(begun) => {
+                    let mut dialogue = begun.dialogue;
+                    let mut ended = self.dialogue.lock().await;
+                    // The receivers of the reachability stay those of the subscription.
+                    dialogue.take_reachability(&mut ended);
+                    *ended = dialogue;
+                    drop(ended);
+                    let mut state = self.queue.state.lock();
+                    state.restarted = true;
+                    state.keep = begun.keep.and_then(|keep| keep.bound(false));
+                    drop(state);
+                    if let Some(early) = begun.early {
+                        self.queue.notification(early);
+                    }
+                    return;
+                }
+                Err(error) => {
+                    let agent = &*self.core.endpoint.name;
+                    tracing::debug!(%error, %agent, "cannot subscribe again");
+                }
+            }
+        }
+    }
+
+    fn is_publisher(&self, name: &str) -> bool {
+        let receivers = self.subscribe.clone().build();
+        receivers.is_ok_and(|message| message.receivers().iter().any(|it| it.name() == name))
+    }
+}
+
 impl Stream for Subscription {
-    type Item = Result<Message, DialogueError>;
+    type Item = Result<Notification, DialogueError>;
 
     fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let this = self.get_mut();
-        if let Some(early) = this.early.take() {
-            return Poll::Ready(Some(Ok(early)));
+        if let Some(message) = this.early.take() {
+            let restarted = false;
+            return Poll::Ready(Some(this.returned(Ok(Received { message, restarted }))));
         }
         if this.is_over {
             return Poll::Ready(None);
         }
-        let dialogue = &this.dialogue;
-        let waiting = this
-            .waiting
-            .get_or_insert_with(|| Box::pin(wait(Arc::clone(dialogue))));
-        let polled = waiting.as_mut().poll(context);
-        if let Poll::Ready(received) = &polled {
-            this.waiting = None;
-            this.is_over = received.as_ref().is_err_and(|error| !goes_on(error));
+        let mut waiting = this.waiting.take().unwrap_or_else(|| this.wait());
+        match waiting.as_mut().poll(context) {
+            Poll::Ready(received) => Poll::Ready(Some(this.returned(received))),
+            Poll::Pending => {
+                this.waiting = Some(waiting);
+                Poll::Pending
+            }
         }
-        polled.map(Some)
     }
 }
 
-/// Whether further notifications can follow after this error.
+/// Whether further notifications can follow after this error, in the same conversation.
 fn goes_on(error: &DialogueError) -> bool {
     matches!(
         error,
@@ -182,6 +635,11 @@ fn goes_on(error: &DialogueError) -> bool {
             | DialogueError::Unchecked(_)
             | DialogueError::Undelivered(_)
     )
+}
+
+/// Whether the publisher has ended, and may return.
+fn can_return(error: &DialogueError) -> bool {
+    matches!(error, DialogueError::Gone { .. } | DialogueError::Failed(_))
 }
 
 impl fmt::Debug for Subscription {

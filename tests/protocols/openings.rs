@@ -5,7 +5,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 
 use fipa::RegisterOptions;
-use fipa::protocol::{PartnerEvent, Subscription};
+use fipa::protocol::{Notification, PartnerEvent, Subscription};
 use fipa_testbed::until_async;
 
 use super::*;
@@ -384,7 +384,7 @@ async fn a_server_runs_a_handler_for_each_opening() {
 }
 
 /// Takes the next item of a stream.
-async fn item(subscription: &mut Subscription) -> Option<Result<Message, DialogueError>> {
+async fn item(subscription: &mut Subscription) -> Option<Result<Notification, DialogueError>> {
     use futures_core::Stream as _;
     std::future::poll_fn(|context| Pin::new(&mut *subscription).poll_next(context)).await
 }
@@ -404,31 +404,28 @@ async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
         let subscribe = to(agent, Performative::Subscribe, &battery, topic);
         agent.subscribe(subscribe, TIMEOUT).await
     };
-    assert_eq!(charge.publish("100").await, 0);
+    assert_eq!(charge.publish("100").await.subscribers(), 0);
     let mut at_rover = subscribe(&rover, "charge").await.unwrap();
     let at_leaver = subscribe(&leaver, "charge").await.unwrap();
     let at_quitter = subscribe(&quitter, "charge").await.unwrap();
     // Another topic has no publisher.
-    let unserved = tokio::spawn(async move {
-        let battery = AgentId::new("battery").unwrap();
-        let heat = other.message(Performative::Subscribe).receiver(battery);
-        let _ = other.subscribe(heat.content("heat"), TIMEOUT).await;
-    });
-    let heat = next_message(&battery).await.unwrap().into_message();
-    assert_eq!(text(&heat), "heat");
-    unserved.abort();
+    let refused = subscribe(&other, "heat").await.unwrap_err().to_string();
+    assert!(
+        refused.contains("there is no such topic; topics: charge"),
+        "{refused}"
+    );
 
     // A subscriber that has received the `agree` gets the next notification.
     assert_eq!(charge.subscribers(), 3);
     assert_eq!(charge.names(), ["leaver", "quitter", "rover"]);
-    assert_eq!(charge.publish("99").await, 3);
+    assert_eq!(charge.publish("99").await.delivered().await, 3);
     assert_eq!(text(&at_rover.next().await.unwrap()), "99");
     at_quitter.cancel(TIMEOUT).await.unwrap();
     until_async("one has cancelled", || charge.subscribers() == 2).await;
     drop(leaver);
     until_async("one is gone", || charge.subscribers() == 1).await;
     drop(at_leaver);
-    assert_eq!(charge.publish("98").await, 1);
+    assert_eq!(charge.publish("98").await.delivered().await, 1);
     // The subscription does not borrow the agent, and is a stream.
     let mut at_rover = tokio::spawn(async move {
         let next = item(&mut at_rover).await.unwrap().unwrap();
@@ -440,12 +437,18 @@ async fn a_publisher_notifies_all_subscribers_and_drops_those_that_are_gone() {
     })
     .await
     .unwrap();
-    assert_eq!(charge.publish("97").await, 1);
+    assert_eq!(charge.publish("97").await.delivered().await, 1);
     assert_eq!(text(&at_rover.next().await.unwrap()), "97");
     drop(charge);
     let ended = item(&mut at_rover).await.unwrap();
     assert!(matches!(ended, Err(DialogueError::Failed(_))), "{ended:?}");
-    assert!(item(&mut at_rover).await.is_none());
+    assert!(at_rover.goes_on());
+    // The topic returns.
+    let charge = battery.publisher("charge").unwrap();
+    until_async("the subscriber returns", || charge.subscribers() == 1).await;
+    assert_eq!(charge.publish("96").await.delivered().await, 1);
+    let next = at_rover.next().await.unwrap();
+    assert_eq!((text(&next), next.is_restart()), ("96", true));
 }
 
 #[tokio::test(flavor = "multi_thread")]
