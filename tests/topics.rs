@@ -1,0 +1,285 @@
+//! Topics between processes: streams, slow and stopped subscribers, latched contents, and publishers that end and return.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+#![allow(clippy::print_stdout, reason = "a child process reports by its output")]
+
+mod support;
+
+use std::io::{BufRead, BufReader, Lines};
+use std::path::Path;
+use std::process::{Child, ChildStdout, Stdio};
+use std::time::Duration;
+
+use fipa::blocking::Wait;
+use fipa::protocol::{DialogueError, Keep, Notification, NotificationResult, Publisher, Topic};
+use fipa::{Agent, Config, Domain, Performative};
+use fipa_testbed::{ignored_test, send_signal, until_async};
+use support::{config, load, mark};
+
+/// Time limit of all calls, which a passing test does not reach.
+const TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Length of an image in bytes.
+const IMAGE: usize = 1 << 20;
+
+/// Settings of a domain that a child process joins, too.
+fn shared(domain: &str) -> Config {
+    load([
+        format!("domain={domain}"),
+        "discovery.mdns=false".to_owned(),
+    ])
+}
+
+async fn subscribed(
+    agent: &Agent,
+    keep: Keep,
+    topic: &str,
+) -> Result<fipa::protocol::Subscription, DialogueError> {
+    let subscribe = agent.message(Performative::Subscribe).receiver("camera");
+    let subscribe = subscribe.content(topic.to_owned());
+    agent.subscribe_keeping(keep, subscribe, TIMEOUT).await
+}
+
+/// A process that prints the notifications it gets.
+struct Viewer {
+    process: Child,
+    lines: Lines<BufReader<ChildStdout>>,
+}
+
+/// A line of a viewer.
+#[derive(Debug, PartialEq, Eq)]
+struct Seen {
+    number: u64,
+    missed: u64,
+    /// The byte that fills the image.
+    fill: u8,
+}
+
+impl Viewer {
+    fn start(domain: &str, name: &str, keep: Keep) -> Self {
+        let mut process = ignored_test("inside_viewer")
+            .env("FIPA_TOPICS_DOMAIN", domain)
+            .env("FIPA_TOPICS_NAME", name)
+            .env("FIPA_TOPICS_KEEP", keep.to_string())
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(process.stdout.take().unwrap()).lines();
+        let mut all = lines.by_ref().map_while(Result::ok);
+        assert!(all.any(|line| line.ends_with("subscribed")), "{name}");
+        Self { process, lines }
+    }
+
+    /// Waits for the next notification.
+    fn seen(&mut self) -> Seen {
+        let mut lines = self.lines.by_ref().map_while(Result::ok);
+        let line = lines.find(|line| line.starts_with("got ")).unwrap();
+        let mut values = line.split(' ').skip(1).map(|it| it.parse().unwrap());
+        let mut value = || values.next().unwrap();
+        Seen {
+            number: value(),
+            missed: value(),
+            fill: u8::try_from(value()).unwrap(),
+        }
+    }
+
+    fn signal(&self, signal: &str) {
+        send_signal(self.process.id(), signal);
+    }
+}
+
+impl Drop for Viewer {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+#[test]
+#[ignore = "is run by the other tests in a process of its own"]
+fn inside_viewer() {
+    let variable = |name: &str| std::env::var(format!("FIPA_TOPICS_{name}")).unwrap();
+    let domain = Domain::open(&shared(&variable("DOMAIN"))).wait().unwrap();
+    let viewer = domain.register(&variable("NAME")).wait().unwrap();
+    let keep = variable("KEEP").parse().unwrap();
+    let mut images = subscribed(&viewer, keep, "image").wait().unwrap();
+    println!("\nsubscribed");
+    loop {
+        let image = match images.next().wait() {
+            Ok(image) => image,
+            Err(error) if images.goes_on() => {
+                println!("lost {error}");
+                continue;
+            }
+            Err(_) => return,
+        };
+        let content = image.content().unwrap();
+        let fill = content.first().copied().unwrap_or_default();
+        assert!(content.iter().all(|byte| *byte == fill), "a torn image");
+        println!("got {} {} {fill}", image.number().unwrap(), image.missed());
+    }
+}
+
+/// Publishes an image that is filled with the low byte of its number.
+async fn publish_image(camera: &Publisher, number: u64) -> fipa::protocol::Publication {
+    let mut loan = camera.loan(IMAGE).unwrap();
+    loan.content_mut().fill(number.to_le_bytes()[0]);
+    let published = camera.publish_loan(loan).await;
+    assert_eq!(published.number(), number);
+    published
+}
+
+/// Number of segments of shared content in a domain.
+fn segments(domain: &str) -> usize {
+    let files = std::fs::read_dir(Path::new("/dev/shm")).unwrap();
+    let names = files.filter_map(|file| file.unwrap().file_name().into_string().ok());
+    names
+        .filter(|name| name.contains(domain) && name.ends_with(".content"))
+        .count()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stopped_viewer_slows_neither_the_camera_nor_other_viewers() {
+    const IMAGES: u64 = 90;
+    let name = format!("topics-{}", mark());
+    let domain = Domain::open(&shared(&name)).await.unwrap();
+    let agent = domain.register("camera").await.unwrap();
+    let camera = agent.publisher(Topic::new("image").rate(30.0)).unwrap();
+    let start = |viewer: &str| Viewer::start(&name, viewer, Keep::Auto);
+    let (mut one, mut two, mut stopped) = (start("one"), start("two"), start("stopped"));
+    until_async("all have subscribed", || camera.subscribers() == 3).await;
+
+    let mut results = tokio::task::JoinSet::new();
+    let mut most = 0;
+    for number in 1..=IMAGES {
+        if number == 15 {
+            assert_eq!(stopped.seen().number, 1);
+            stopped.signal("-STOP");
+        }
+        let published = publish_image(&camera, number).await;
+        assert_eq!(published.subscribers(), 3);
+        results.spawn(published.results());
+        let fill = number.to_le_bytes()[0];
+        let expected = Seen {
+            number,
+            missed: 0,
+            fill,
+        };
+        // The next image is published when these two have this one.
+        assert_eq!(one.seen(), expected);
+        assert_eq!(two.seen(), expected);
+        most = most.max(segments(&name));
+    }
+    // That of the stopped viewer, the newest one, the next one, and one that a viewer is about to release.
+    assert!(most <= 5, "{most} segments");
+
+    stopped.signal("-CONT");
+    let mut last = Vec::new();
+    while last.last().is_none_or(|seen: &Seen| seen.number < IMAGES) {
+        last.push(stopped.seen());
+    }
+    // Those before the stop, the one that was under way, and the newest.
+    let after: Vec<&Seen> = last.iter().filter(|seen| seen.number >= 15).collect();
+    assert!(after.len() <= 3, "{last:?}");
+    let missed: u64 = last.iter().map(|seen| seen.missed).sum();
+    assert!(missed >= IMAGES - 18, "{last:?}");
+
+    let mut replaced = 0;
+    while let Some(result) = results.join_next().await {
+        for notified in result.unwrap() {
+            match notified.result {
+                NotificationResult::Replaced => {
+                    assert_eq!(notified.subscriber, "stopped");
+                    replaced += 1;
+                }
+                result => assert!(result.is_success(), "{result:?}"),
+            }
+        }
+    }
+    assert!(replaced >= IMAGES - 18, "{replaced} replaced");
+    drop((one, two, stopped));
+    domain.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stopped_viewer_of_all_images_delays_the_camera_and_its_images_fail_in_the_end() {
+    let name = format!("topics-{}", mark());
+    let domain = Domain::open(&shared(&name)).await.unwrap();
+    let agent = domain.register("camera").await.unwrap();
+    let topic = Topic::new("image").wait_for_slow(Duration::from_millis(1));
+    let camera = agent.publisher(topic).unwrap();
+    let mut stopped = Viewer::start(&name, "stopped", Keep::All);
+    stopped.signal("-STOP");
+    let mut results = Vec::new();
+    for number in 1..=80_u8 {
+        let published = camera.publish(vec![number; 10]).await;
+        results.push(tokio::spawn(published.results()));
+    }
+    stopped.signal("-CONT");
+    let mut too_slow = 0;
+    for result in results {
+        let notified = result.await.unwrap().remove(0);
+        match notified.result {
+            NotificationResult::TooSlow => too_slow += 1,
+            result => assert!(result.is_success(), "{result:?}"),
+        }
+    }
+    // One was under way, and 64 waited.
+    assert_eq!(too_slow, 15);
+    for number in 1..=65 {
+        let seen = stopped.seen();
+        assert_eq!((seen.number, seen.missed), (number, 0));
+    }
+    let last = camera.publish(vec![81; 10]).await;
+    assert_eq!(last.delivered().await, 1);
+    let seen = stopped.seen();
+    assert_eq!((seen.number, seen.missed, seen.fill), (81, 15, 81));
+    domain.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_new_subscriber_gets_the_latched_contents_at_once() {
+    let config = config(&[]);
+    let (here, there) = support::two(&config).await;
+    let agent = here.register("camera").await.unwrap();
+    let map = agent.publisher(Topic::new("map").latched(2)).unwrap();
+    for content in ["a", "b", "c"] {
+        assert_eq!(map.publish(content).await.subscribers(), 0);
+    }
+    let rover = there.register("rover").await.unwrap();
+    let mut all = subscribed(&rover, Keep::All, "map").await.unwrap();
+    let mut newest = subscribed(&rover, Keep::latest(1), "map").await.unwrap();
+    let text = |notification: Notification| notification.text();
+    assert_eq!(text(all.next().await.unwrap()), "b");
+    assert_eq!(text(all.next().await.unwrap()), "c");
+    let newest = newest.next().await.unwrap();
+    assert_eq!((newest.text(), newest.missed()), ("c".into(), 0));
+    assert!(newest.age().unwrap() < TIMEOUT);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_program_that_does_not_read_keeps_the_newest_and_other_messages_arrive() {
+    let (here, there) = support::two(&config(&[])).await;
+    let agent = here.register("camera").await.unwrap();
+    let camera = agent.publisher(Topic::new("image").rate(100.0)).unwrap();
+    let rover = there.register("rover").await.unwrap();
+    let mut images = subscribed(&rover, Keep::latest(3), "image").await.unwrap();
+    for number in 1..=2_000_u32 {
+        let published = camera.publish(number.to_string()).await;
+        // The rover's process is not stopped, so each one is delivered.
+        assert_eq!(published.delivered().await, 1);
+    }
+    let hello = agent.message(Performative::Inform).receiver("rover");
+    assert!(agent.send(hello).await.unwrap().all_succeeded());
+    let received = rover.receive_within(TIMEOUT).await.unwrap().unwrap();
+    assert_eq!(received.message().content(), None);
+    let mut numbers = Vec::new();
+    while numbers.last() != Some(&2_000) {
+        numbers.push(images.next().await.unwrap().number().unwrap());
+    }
+    // A task reads them, and may not have read the last ones when the first call returns.
+    assert!(numbers.len() < 1_000, "{} were kept", numbers.len());
+    assert!(numbers.ends_with(&[1_998, 1_999, 2_000]), "{numbers:?}");
+    assert!(images.rate().unwrap() > 0.0);
+}
