@@ -11,7 +11,7 @@ mod support;
 use std::time::Duration;
 
 use fipa::error::SendError;
-use fipa::protocol::{DialogueError, Reply, Task};
+use fipa::protocol::{DialogueError, Reply, Task, Topic};
 use fipa::{Agent, AgentId, Config, Domain, Performative};
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
@@ -130,6 +130,35 @@ async fn a_subscriber_is_notified() -> Result<()> {
     // ANCHOR_END: publish
     assert_eq!(reached, 1);
     assert_eq!(&notification.content().unwrap()[..], b"87");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_camera_loans_its_images() -> Result<()> {
+    let (rover, camera) = two_agents(&[]).await;
+    // ANCHOR: camera
+    let images = camera.publisher(Topic::new("image").rate(30.0))?;
+
+    // In the process of a viewer:
+    let subscribe = rover
+        .message(Performative::Subscribe)
+        .receiver(camera.id().clone())
+        .content("image");
+    let mut viewed = rover.subscribe(subscribe, Duration::from_secs(60)).await?;
+
+    // In the process of the camera, for each image:
+    let mut image = images.loan(1_000_000)?;
+    image.content_mut().fill(7);
+    let published = images.publish_loan(image).await;
+    println!(
+        "image {} for {} viewers",
+        published.number(),
+        published.subscribers()
+    );
+    // ANCHOR_END: camera
+    assert_eq!(published.delivered().await, 1);
+    let content = viewed.next().await?.into_message();
+    assert!(content.content().unwrap().iter().all(|byte| *byte == 7));
     Ok(())
 }
 

@@ -203,6 +203,44 @@ async fn a_stopped_viewer_slows_neither_the_camera_nor_other_viewers() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn each_of_many_stopped_viewers_holds_one_image() {
+    const VIEWERS: u64 = 16;
+    let name = format!("topics-{}", mark());
+    let domain = Domain::open(&shared(&name)).await.unwrap();
+    let agent = domain.register("camera").await.unwrap();
+    let camera = agent.publisher(Topic::new("image").rate(30.0)).unwrap();
+    let viewers = 0..VIEWERS;
+    let viewers = viewers.map(|viewer| Viewer::start(&name, &format!("v{viewer}"), Keep::Auto));
+    let mut viewers: Vec<Viewer> = viewers.collect();
+    until_async("all have subscribed", || {
+        camera.subscribers() == viewers.len()
+    })
+    .await;
+    // The next image finds one more viewer stopped.
+    for number in 1..=VIEWERS {
+        let stopped = usize::try_from(number).unwrap() - 1;
+        viewers[stopped].signal("-STOP");
+        drop(publish_image(&camera, number).await);
+        for viewer in &mut viewers[stopped + 1..] {
+            assert_eq!(viewer.seen().number, number);
+        }
+    }
+    // Each stopped viewer holds another image. The newest ones wait, and the next one is written.
+    for number in VIEWERS + 1..VIEWERS + 20 {
+        drop(publish_image(&camera, number).await);
+    }
+    let held = segments(&name);
+    let most = usize::try_from(VIEWERS).unwrap() + 3;
+    assert!(held <= most, "{held} segments");
+    for viewer in &mut viewers {
+        viewer.signal("-CONT");
+        while viewer.seen().number < VIEWERS + 19 {}
+    }
+    drop(viewers);
+    domain.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_stopped_viewer_of_all_images_delays_the_camera_and_its_images_fail_in_the_end() {
     let name = format!("topics-{}", mark());
     let domain = Domain::open(&shared(&name)).await.unwrap();

@@ -14,8 +14,8 @@ use crate::errors::allocating;
 use crate::memory::{Budget, PAGE, no_room_error, populate};
 use crate::segment::{ContentReference, SegmentFile};
 
-/// Maximum number of segments of a process.
-const MAX_SEGMENTS: usize = 8;
+/// Maximum number of segments of a process. Each receiver that is stopped may hold one.
+const MAX_SEGMENTS: usize = 64;
 
 /// Fraction of the domain's capacity, as a divisor, that idle segments of a process may use. The
 /// next content then finds its pages allocated.
