@@ -13,6 +13,8 @@ pub(crate) mod incoming;
 pub(crate) mod lock_slot;
 pub(crate) mod sender_tasks;
 pub(crate) mod stated;
+#[cfg(feature = "protocols")]
+pub(crate) mod topics;
 #[cfg(not(feature = "protocols"))]
 pub(crate) mod without_protocols;
 
@@ -66,7 +68,7 @@ pub(crate) struct AgentCore {
     pub(crate) demultiplexer: Demultiplexer,
     pub(crate) locks: LockSlot,
     #[cfg(feature = "protocols")]
-    pub(crate) topics: crate::protocol::Topics,
+    pub(crate) topics: topics::Topics,
     #[cfg(feature = "actions")]
     pub(crate) actions: crate::actions::table::ActionTable,
 }
@@ -157,7 +159,7 @@ impl Domain {
                     demultiplexer: Demultiplexer::default(),
                     locks: LockSlot::default(),
                     #[cfg(feature = "protocols")]
-                    topics: crate::protocol::Topics::default(),
+                    topics: topics::Topics::default(),
                     #[cfg(feature = "actions")]
                     actions: crate::actions::table::ActionTable::default(),
                 });

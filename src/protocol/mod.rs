@@ -36,7 +36,8 @@
 //!   shell around it; `reachability.rs` reports it. `receivers.rs` expands patterns and coalitions.
 //! * `protocols.rs` is the view of the rarer calls. `initiator.rs`, `subscription.rs`, `contract_net.rs`, `auction.rs` and `proxied.rs` are the sides
 //!   of initiators; `bids.rs` collects the answers to a call for proposals. `participant.rs` is the
-//!   side of participants; `serving.rs` and `publisher.rs` lead many of them.
+//!   side of participants; `serving.rs` and `publisher.rs` lead many of them. `topic.rs` has what publishers and
+//!   subscribers say to each other.
 //!
 //! Not in this module: the rules of the protocols (`fipa-monitor`).
 
@@ -69,7 +70,6 @@ pub use participant::{Reply, Task};
 pub use partners::PartnerEvent;
 pub use protocols::Protocols;
 pub use proxied::Proxied;
-pub(crate) use publisher::Topics;
 pub use publisher::{NotificationResult, Notified, Publication, Publisher, TopicLoan};
 pub use reachability::{Reachability, Unreachable};
 pub use serving::Server;

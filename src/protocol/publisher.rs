@@ -3,7 +3,7 @@
 //! Each subscriber has a task and a queue of its own, so a slow one delays no other. One notification is under way to
 //! each; the queue has those that wait. The queue of a subscriber that keeps the newest `n` never has more.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::fmt;
 use std::pin::Pin;
 use std::sync::{Arc, Weak};
@@ -33,9 +33,6 @@ const MAX_WAITING: usize = 64;
 /// Maximum number of subscribers of one publisher. One host alone gets a quarter of them. Further ones of a host that has
 /// its share are refused.
 const MAX_SUBSCRIBERS: usize = 4_096;
-
-/// Maximum length in bytes of the list of topics in a refusal.
-const MAX_LISTED: usize = 1_000;
 
 impl Agent {
     /// Publishes a topic: accepts the subscriptions (`subscribe`, FIPA00035) whose content is its name. One call of
@@ -80,7 +77,7 @@ impl Agent {
         });
         let queue = ServedQueue::new(&self.core, opens);
         let task = runtime.spawn(accept(queue, Arc::clone(&shared)));
-        declare(&self.core, name)?;
+        declare(&self.core, &name)?;
         Ok(Publisher {
             shared,
             task,
@@ -324,7 +321,7 @@ impl fmt::Debug for Publisher {
 impl Drop for Publisher {
     fn drop(&mut self) {
         self.task.abort();
-        undeclare(&self.core, self.shared.topic.name());
+        self.core.topics.remove(self.shared.topic.name());
         let subscribers = std::mem::take(&mut self.shared.state.lock().subscribers);
         for subscriber in subscribers.into_values() {
             subscriber.added.notify_one();
@@ -443,72 +440,23 @@ impl Subscriber {
     }
 }
 
-/// The topics of an agent, with the number of publishers of each, and the task that refuses others.
-#[derive(Debug, Default)]
-pub(crate) struct Topics(Mutex<Declared>);
-
-#[derive(Debug, Default)]
-struct Declared {
-    topics: BTreeMap<String, usize>,
-    refusing: Option<JoinHandle<()>>,
-}
-
-impl Drop for Declared {
-    fn drop(&mut self) {
-        if let Some(refusing) = &self.refusing {
-            refusing.abort();
-        }
-    }
-}
-
-impl Topics {
-    fn refusal(&self) -> String {
-        let mut text = "there is no such topic; topics:".to_owned();
-        for topic in self.0.lock().topics.keys() {
-            if text.len() + topic.len() > MAX_LISTED {
-                text += " ...";
-                break;
-            }
-            text = text + " " + topic;
-        }
-        text
-    }
-}
-
 /// Has an agent refuse subscriptions to other topics than its own.
-fn declare(core: &Arc<AgentCore>, topic: String) -> Result<(), DialogueError> {
-    let is_first = {
-        let mut declared = core.topics.0.lock();
-        *declared.topics.entry(topic).or_default() += 1;
-        declared.refusing.is_none()
-    };
-    if !is_first {
+fn declare(core: &Arc<AgentCore>, topic: &str) -> Result<(), DialogueError> {
+    if !core.topics.add(topic) {
         return Ok(());
     }
     let agent = Arc::downgrade(core);
     let opens = opening(core, "fipa-subscribe", move |_| {
-        let core = agent.upgrade();
-        core.is_some_and(|core| !core.topics.0.lock().topics.is_empty())
+        agent.upgrade().is_some_and(|core| !core.topics.is_empty())
     })?;
     let queue = ServedQueue::last(core, opens);
     let runtime = &core.endpoint.domain.inner.service.runtime;
-    let refusing = runtime.spawn(async move {
+    runtime.spawn(async move {
         while let Some(first) = queue.next().await {
             refuse(queue.agent(), &first, &queue.agent().topics.refusal());
         }
     });
-    core.topics.0.lock().refusing = Some(refusing);
     Ok(())
-}
-
-fn undeclare(core: &AgentCore, topic: &str) {
-    let mut declared = core.topics.0.lock();
-    if let Some(count) = declared.topics.get_mut(topic) {
-        *count -= 1;
-        if *count == 0 {
-            declared.topics.remove(topic);
-        }
-    }
 }
 
 /// Accepts subscriptions until the agent ends.
