@@ -99,7 +99,7 @@ fn written_records_are_accepted(letter: &Letter) {
         sequence: 3,
         receiver: "arm_1".into(),
         news: News::Sent {
-            send: Some(SubmissionId(9)),
+            submission: Some(SubmissionId(9)),
             letter: letter.clone(),
         },
     };
