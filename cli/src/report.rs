@@ -161,6 +161,11 @@ pub(crate) fn warn(text: &str) {
     to_stderr(&format!("warning: {}\n", indented(text)));
 }
 
+/// Tells the user about the course of the command.
+pub(crate) fn note(text: &str) {
+    to_stderr(&format!("{}\n", indented(text)));
+}
+
 /// Warns of each user-defined performative that differs from one of FIPA by a typing error. User-defined
 /// ones are legal, so the command continues.
 pub(crate) fn warn_of_performatives<'a>(performatives: impl IntoIterator<Item = &'a Performative>) {

@@ -24,6 +24,7 @@ mod man;
 mod own;
 mod ping;
 mod protocol;
+mod publish;
 mod request;
 mod routes;
 mod send;
@@ -45,6 +46,7 @@ pub(crate) enum Command {
     Echo(echo::Arguments),
     Listen(listen::Arguments),
     Request(request::Arguments),
+    Publish(publish::Arguments),
     Subscribe(subscribe::Arguments),
     Ping(ping::Arguments),
     Coalition(coalition::Arguments),
@@ -80,6 +82,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Echo(arguments) => echo::run(arguments, global),
         Command::Listen(arguments) => listen::run(arguments, global),
         Command::Request(arguments) => request::run(arguments, global),
+        Command::Publish(arguments) => publish::run(arguments, global),
         Command::Subscribe(arguments) => subscribe::run(arguments, global),
         Command::Ping(arguments) => ping::run(arguments, global),
         Command::Coalition(arguments) => coalition::run(arguments, global),

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use clap::Args;
-use fipa::protocol::{DialogueError, Subscription};
+use fipa::protocol::{DialogueError, Keep, Notification, Subscription};
 use fipa::{Agent, AgentId, Performative};
-use fipa_acl::escape_name;
+use fipa_acl::{escape, escape_name};
 use serde_json::json;
 
 use super::request::{CANCEL_WITHIN, Opening, failed, line, unless_stopped};
@@ -17,19 +17,23 @@ use crate::report::{self, Failure};
 
 /// Subscribe to the notifications of an agent (FIPA00035)
 ///
-/// Leads the protocol fipa-subscribe: prints each notification until Ctrl-C, which cancels the
-/// subscription. A silent host of the agent is reported and does not end the command. The exit code is 1
+/// Leads the protocol fipa-subscribe: prints the content of each notification until Ctrl-C, which cancels the
+/// subscription. Gaps are reported on standard error. A silent host of the agent is reported and does not end the command. The exit code is 1
 /// if the agent refuses, ends the subscription, leaves or dies.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa subscribe battery charge
   fipa subscribe battery charge --count 1
+  fipa subscribe camera image --raw --count 1 > image.jpg      the newest image
+  fipa subscribe door events --keep all
   fipa subscribe battery charge --json | jq -r .notification.content
 
 JSON, one object on each line:
   { \"subscribed\": name }                     when the agent has agreed
-  { \"notification\": the message as `fipa decode` prints it }")]
+  { \"notification\": the message as `fipa decode` prints it,
+    \"missed\": number of notifications before it that were replaced or failed,
+    \"age_ms\": time since the publication by the clocks of both hosts, or null }")]
 pub(crate) struct Arguments {
     /// Name of the agent
     #[arg(add = complete::agents())]
@@ -37,6 +41,19 @@ pub(crate) struct Arguments {
 
     /// Content of the subscription: for an agent of this project, the topic of the publisher
     content: String,
+
+    /// What to get if this command is slower than the publisher: all, latest(N), or auto, which is the newest one of
+    /// a stream and all of others
+    #[arg(long, value_name = "KEEP", default_value = "auto")]
+    keep: Keep,
+
+    /// Print the messages with all parameters
+    #[arg(long, conflicts_with = "json")]
+    full: bool,
+
+    /// Print the bytes of the contents unchanged and without line ends, for a file or another program
+    #[arg(long, conflicts_with_all = ["json", "full"])]
+    raw: bool,
 
     /// End after this number of notifications
     #[arg(long, short, value_name = "N")]
@@ -84,17 +101,18 @@ async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result
     let opening = arguments.opening.message(agent, act, name, content);
     let opening = opening.await?;
     let subscribed = tokio::select! {
-        subscribed = agent.subscribe(opening, arguments.timeout) => subscribed,
+        subscribed = agent.subscribe_keeping(arguments.keep, opening, arguments.timeout) => subscribed,
         () = stop.requested() => return Ok(()),
     };
     let mut subscription = subscribed.map_err(|error| failed(&error, name))?;
     let mut reachability = subscription.reachability();
     match arguments.json {
         true => output::json_line(&json!({ "subscribed": name.name() }))?,
-        false => output::text(&format!(
-            "subscribed to {}; press Ctrl-C to stop\n",
+        // The output has the contents alone.
+        false => report::note(&format!(
+            "subscribed to {}; press Ctrl-C to stop",
             escape_name(name.name())
-        ))?,
+        )),
     }
     let mut reader = Reader::of_output();
     let print = async {
@@ -119,17 +137,36 @@ async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result
 async fn print_all(subscription: &mut Subscription, arguments: &Arguments) -> Result<(), Failure> {
     let mut count = 0;
     while arguments.count.is_none_or(|most| count < most) {
-        let message = match subscription.next().await {
-            Ok(message) => message,
+        let notification = match subscription.next().await {
+            Ok(notification) => notification,
             // Reported as a change of the reachability.
             Err(DialogueError::Unreachable { .. }) => continue,
             Err(error) => return Err(failed(&error, &arguments.name)),
         };
         count += 1;
-        match arguments.json {
-            true => output::json_line(&line("notification", &message))?,
-            false => output::text(&format!("{message}\n"))?,
-        }
+        print(&notification, arguments)?;
     }
     Ok(())
+}
+
+fn print(notification: &Notification, arguments: &Arguments) -> Result<(), Failure> {
+    if arguments.json {
+        let mut line = line("notification", notification);
+        line["missed"] = notification.missed().into();
+        let age = notification.age().map(|age| age.as_millis());
+        line["age_ms"] = json!(age);
+        return output::json_line(&line);
+    }
+    match notification.missed() {
+        0 => {}
+        missed => report::note(&format!("{missed} missed")),
+    }
+    let content = notification.content().map_or(&[][..], |content| content);
+    if arguments.raw {
+        return output::bytes(content);
+    }
+    output::text(&match arguments.full {
+        true => format!("{notification}\n"),
+        false => format!("{}\n", escape(&String::from_utf8_lossy(content))),
+    })
 }

@@ -1,11 +1,10 @@
 //! `fipa send`: sends one message and prints its outcomes.
 
 mod advice;
-mod repeat;
+pub(super) mod repeat;
 mod settle;
 
 use std::collections::HashSet;
-use std::convert::Infallible;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
@@ -50,7 +49,7 @@ use self::settle::Settled;
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  fipa send --to arm_1 --content hello
+  fipa send arm_1 hello
   fipa send --to arm_1 --performative request --content '(lift sample-3)' --wait
   fipa send --to 'arm_.*' --content stop               to all agents whose names match
   fipa send --to camera --content-file picture.raw --deadline 30s
@@ -74,10 +73,10 @@ JSON:
 
 With --count or --rate, one object on each line:
   { \"number\": of the message, from 1, \"deliveries\": as above }
-  { \"messages\": number, \"delivered\" and \"failed\": numbers of outcomes, \"seconds\": number }  at the end")]
+  { \"messages\": number, \"delivered\", \"sent\" and \"failed\": numbers of outcomes, \"seconds\": number }  at the end")]
 pub(crate) struct Arguments {
     /// Name of the receiver, or a pattern such as 'arm_.*'; repeatable
-    #[arg(long, required = true, value_name = "NAME", add = complete::agents())]
+    #[arg(long, value_name = "NAME", add = complete::agents())]
     to: Vec<AgentId>,
 
     #[command(flatten)]
@@ -143,15 +142,13 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     parameters: Parameters,
 
-    /// Refused with the options to write instead.
-    #[arg(hide = true, value_name = "WORD", value_parser = misplaced)]
-    misplaced: Vec<Infallible>,
-}
+    /// Name of the receiver: a short form of --to
+    #[arg(value_name = "NAME", required_unless_present = "to", add = complete::agents())]
+    receiver: Option<AgentId>,
 
-fn misplaced(_: &str) -> Result<Infallible, &'static str> {
-    Err(
-        "the receiver follows --to, and the content --content: `fipa send --to NAME --content TEXT`",
-    )
+    /// Content of the message: a short form of --content
+    #[arg(value_name = "TEXT", conflicts_with_all = ["content", "content_file"])]
+    text: Option<String>,
 }
 
 /// The other parameters of a message (FIPA00061).
@@ -201,6 +198,17 @@ struct Parameters {
 
 pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
+    if let Some(receiver) = arguments.receiver.take() {
+        if !arguments.to.is_empty() {
+            return Err(Failure::wrong_usage(
+                format!("{:?} is given beside --to", receiver.name()),
+                "NAME",
+                "write `fipa send NAME TEXT`, or `fipa send --to NAME --content TEXT`",
+            ));
+        }
+        arguments.to.push(receiver);
+        arguments.content = arguments.text.take().or(arguments.content);
+    }
     if arguments.addresses.is_given() && arguments.to.len() != 1 {
         return Err(Failure::wrong_usage(
             "--address is the address of one receiver",

@@ -18,7 +18,7 @@ use crate::report::Failure;
 const MAX_UNDER_WAY: usize = 256;
 
 /// Parses a number of messages per second.
-pub(super) fn rate(text: &str) -> Result<f64, String> {
+pub(in crate::command) fn rate(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(rate) if (0.001..=1e6).contains(&rate) => Ok(rate),
         _ => Err("expected messages per second, from 0.001 to 1000000".to_owned()),
