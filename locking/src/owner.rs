@@ -41,7 +41,7 @@ pub struct Owner {
     /// Time before which a grant of a life elsewhere may be live.
     absent_until: Option<Millis>,
     /// Time before which a grant of an earlier life may be live.
-    silent_until: Option<Millis>,
+    no_grants_until: Option<Millis>,
     live: Option<Grant>,
     /// Holder whose grant expired, until it reports or ends.
     unproved: Option<(LockPeer, Conversation)>,
@@ -149,7 +149,7 @@ impl Owner {
             number: 0,
             lease,
             absent_until: (life.absence() > 0).then(|| now.saturating_add(life.absence())),
-            silent_until: (silence > 0).then(|| now.saturating_add(silence)),
+            no_grants_until: (silence > 0).then(|| now.saturating_add(silence)),
             live: None,
             unproved: None,
             queue: Queue::default(),
@@ -181,7 +181,7 @@ impl Owner {
     /// Agents that the owner lets pass in the algorithm.
     #[must_use]
     pub fn gate(&self) -> Gate {
-        if self.live.is_some() || self.silent_until.is_some() || self.storing.is_some() {
+        if self.live.is_some() || self.no_grants_until.is_some() || self.storing.is_some() {
             Gate::Closed
         } else if self.unproved.is_some() {
             Gate::Own
@@ -200,7 +200,7 @@ impl Owner {
         };
         expires
             .into_iter()
-            .chain(self.silent_until)
+            .chain(self.no_grants_until)
             .chain(self.absent_until)
             .chain(turn)
             .min()
@@ -209,7 +209,7 @@ impl Owner {
     /// Time in which the owner grants nothing, because a grant of an earlier life may be live.
     #[must_use]
     pub fn silence(&self, now: Millis) -> Millis {
-        self.silent_until
+        self.no_grants_until
             .map_or(0, |until| until.saturating_sub(now))
     }
 
@@ -239,7 +239,7 @@ impl Owner {
         self.reported = self.reported.max(Some(fence.epoch()));
         // Lives on this host are in the file, with their leases.
         if fence.epoch() > self.before && self.absent_until.is_some_and(|until| now < until) {
-            self.silent_until = self.silent_until.max(self.absent_until);
+            self.no_grants_until = self.no_grants_until.max(self.absent_until);
         }
     }
 
@@ -268,7 +268,7 @@ impl Owner {
         out: &mut Vec<OwnerStep>,
     ) {
         self.confirm(now, from, conversation, Some(asked), out);
-        if self.silent_until.is_some()
+        if self.no_grants_until.is_some()
             && let Some(place) = place
         {
             self.queue.sort_in(from, place);
@@ -439,8 +439,8 @@ impl Owner {
     /// Ends the lease and the silence that are over.
     pub(crate) fn handle_timeout(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
         let over = |until: Option<Millis>| until.is_some_and(|until| until <= now);
-        if over(self.silent_until) {
-            self.silent_until = None;
+        if over(self.no_grants_until) {
+            self.no_grants_until = None;
         }
         if over(self.absent_until) {
             self.absent_until = None;
@@ -485,7 +485,7 @@ impl Owner {
     fn grant_next(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
         self.begin_next(now, out);
         // The order can change until the end of the silence.
-        if self.silent_until.is_none() {
+        if self.no_grants_until.is_none() {
             self.queue.tell(out);
         }
     }
@@ -575,7 +575,7 @@ impl Owner {
         let expires = self.live.as_mut().and_then(|live| live.expires.as_mut());
         for time in expires
             .into_iter()
-            .chain(&mut self.silent_until)
+            .chain(&mut self.no_grants_until)
             .chain(&mut self.absent_until)
         {
             *time = time.saturating_sub(by);

@@ -5,6 +5,7 @@
 //! agents of this host to other hosts, and publishes the agents of other hosts to the processes of
 //! this host.
 
+mod directory_sync;
 mod exchange;
 mod exchange_queues;
 mod gateway_agent;
@@ -16,7 +17,6 @@ mod namesakes;
 mod neighbors;
 mod platform_agents;
 mod publish_pace;
-mod publisher;
 mod state;
 
 use std::collections::BTreeMap;
@@ -41,6 +41,7 @@ use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
+use self::directory_sync::{DirectorySync, DirectorySyncTask};
 use self::exchange::{Exchanging, Means};
 use self::gateway_agent::GatewayAgent;
 #[cfg(feature = "fuzzing")]
@@ -52,7 +53,6 @@ use self::namesakes::Namesakes;
 pub use self::neighbors::Neighbor;
 use self::neighbors::{Neighbors, View};
 use self::platform_agents::PlatformAgents;
-use self::publisher::{PublishTask, Publisher};
 #[cfg(feature = "fuzzing")]
 pub(crate) use self::state::play as play_state;
 use self::state::{Predecessor, StateFile, Trust};
@@ -180,7 +180,7 @@ impl Gateway {
         }
         // Only the gateway of the domain uses the file, and it does so before it answers letters.
         let predecessor = Arc::new(gateway.state.take_over());
-        let publisher = Arc::new(Publisher {
+        let publisher = Arc::new(DirectorySync {
             host: Arc::clone(&gateway.service.host),
             network: gateway.network.clone().map(Network::directory),
             known: Arc::clone(&known),
@@ -193,7 +193,7 @@ impl Gateway {
         // the letter is delivered.
         *known_peers.publisher.lock() = Some(Arc::clone(&publisher));
         known_peers.network.lock().clone_from(&gateway.network);
-        let publish_task = PublishTask::new(publisher, gateway.network.clone());
+        let publish_task = DirectorySyncTask::new(publisher, gateway.network.clone());
         gateway.tasks.push(tokio::spawn(publish_task.run()));
         let follow = follow_locations(Arc::clone(&gateway.service), Arc::clone(&gateway.neighbors));
         gateway.tasks.push(tokio::spawn(follow));
@@ -486,7 +486,7 @@ fn register(service: &Service, cancellation: &Cancellation) -> Result<Arc<Entry>
 
 /// Updates the gateway's own entry and greets its neighbors when its locations change. The
 /// greetings are needed because the directory of the network does not reach all neighbors.
-/// [`PublishTask`] updates the announcements of the agents.
+/// [`DirectorySyncTask`] updates the announcements of the agents.
 async fn follow_locations(service: Arc<Service>, neighbors: Arc<Neighbors>) {
     let mut locations = service.follow_locations();
     while locations.changed().await.is_ok() {
@@ -624,7 +624,7 @@ fn network(_: &Config, _: &fipa_sds::MtsId) -> Result<Option<Arc<dyn Network>>, 
 struct KnownPeers {
     neighbors: Arc<Neighbors>,
     directory: Arc<ContactDirectory>,
-    publisher: Mutex<Option<Arc<Publisher>>>,
+    publisher: Mutex<Option<Arc<DirectorySync>>>,
     network: Mutex<Option<Arc<dyn Network>>>,
     /// The platforms that have taken letters.
     takers: Takers,

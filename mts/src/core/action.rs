@@ -8,7 +8,7 @@ use fipa_transport::{
 };
 
 use super::ids::SubmissionId;
-use super::notice::Notice;
+use super::watch_event::Notice;
 
 /// An action that the runtime performs for the delivery core.
 #[derive(Debug)]

@@ -12,10 +12,10 @@ use fipa_transport::{
 };
 
 use super::action::Action;
-use super::custody_budget::CustodyBudget;
 use super::departed::Departed;
 use super::ids::{LaneId, registration_by_name};
 use super::label::PredecessorNote;
+use super::lane_budget::LaneBudget;
 use super::notes::{Note, Notes, note_parcel};
 use super::routes::Routes;
 use super::tally::Tallies;
@@ -45,7 +45,7 @@ pub(crate) struct AttemptTable {
     pub(crate) departed: Departed,
     /// Services whose certificate is no longer trusted.
     pub(crate) withdrawn: Map<Incarnation, Principal>,
-    pub(super) custody: CustodyBudget,
+    pub(super) custody: LaneBudget,
     pub(super) routes: Routes,
     pub(super) tallies: Tallies,
     /// Whether a watcher is notified of events.
@@ -73,7 +73,7 @@ impl AttemptTable {
             notes: Notes::default(),
             departed: Departed::default(),
             withdrawn: Map::default(),
-            custody: CustodyBudget::default(),
+            custody: LaneBudget::default(),
             routes: Routes::default(),
             tallies: Tallies::default(),
             watched: false,

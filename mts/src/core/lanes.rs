@@ -32,7 +32,7 @@ impl Core {
     pub(super) fn put(&mut self, now: Now, lane: LaneId, open_letter: Box<OpenLetter>) {
         self.with_lane(now, lane, |lane, table| {
             lane.push(open_letter, table);
-            lane.pump(now.instant, table);
+            lane.dispatch_all(now.instant, table);
         });
     }
 

@@ -18,7 +18,7 @@
 //! * `lane`: it is among the open letters of one stream, in order, on one route at a time; `lanes` creates,
 //!   visits and drops lanes, `passes` divides visits of all lanes into portions.
 //! * `routes`: the choice of the location that it goes to, and the failures of locations.
-//! * `forward`: a gateway takes it into custody, as far as `custody_budget` has room.
+//! * `forward`: a gateway takes it into custody, as far as `lane_budget` has room.
 //! * `inbox`: it is accepted once and in order into an agent's queue.
 //! * `settlement`: its sender, or the services that handed it over, are told its end.
 //!
@@ -51,19 +51,18 @@ mod arrival;
 mod attempts;
 mod config;
 mod contacts;
-mod custody_budget;
+mod custody;
 mod departed;
 mod failures;
-mod forward;
 mod ids;
 mod inbox;
 mod label;
 mod lane;
+mod lane_budget;
 mod lanes;
 mod limits;
 mod network;
 mod notes;
-mod notice;
 mod origin;
 mod passes;
 mod peers;
@@ -79,6 +78,7 @@ mod tally;
 mod undelivered;
 mod unframed;
 mod waiting;
+mod watch_event;
 #[doc(hidden)]
 pub mod work;
 
@@ -103,7 +103,6 @@ pub use self::inbox::Received;
 use self::lane::{Lane, PauseEnd};
 use self::lanes::{IDLE_LANES, LANES_AT_ONCE};
 use self::limits::{FailureLimit, SenderLimit};
-pub use self::notice::{News, Notice};
 use self::passes::Passes;
 use self::peers::Peers;
 pub use self::peers::{Peer, PeerState};
@@ -113,6 +112,7 @@ pub use self::route_report::{Route, RouteCandidate, RouteState, Standing};
 pub use self::submit::Submission;
 pub use self::unframed::Unframed;
 use self::waiting::{Unresolved, WaitingLetters};
+pub use self::watch_event::{News, Notice};
 use crate::{AccessGate, Map};
 
 /// The current time by two clocks.
@@ -353,7 +353,7 @@ impl Core {
             }
         }
         for id in lanes {
-            self.with_lane(now, id, |lane, table| lane.pump(now.instant, table));
+            self.with_lane(now, id, |lane, table| lane.dispatch_all(now.instant, table));
         }
         self.visit_lanes(now);
         if !self.waiting.is_empty() {

@@ -14,8 +14,8 @@ use super::super::label::HandedOver;
 use super::super::origin::Settlement;
 use super::super::rules::{self, AttemptEnd, Belief, Cause, CustodyReport};
 use super::super::tally::Tally;
-use super::custody::ASK_CUSTODIAN_AFTER;
 use super::open_letter::{Departure, State};
+use super::predecessors::ASK_CUSTODIAN_AFTER;
 use super::{CONGESTED_TRIES, ENDED_TIMEOUT, Lane, LaneKey, MOVING_TIMEOUT};
 
 impl Lane {
@@ -88,7 +88,7 @@ impl Lane {
                 self.came_back(now, index, &location, (error, Cause::Unconfirmed), table);
             }
         }
-        self.pump(now, table);
+        self.dispatch_all(now, table);
     }
 
     fn answered(
@@ -233,7 +233,7 @@ impl Lane {
                 None => {}
             }
         }
-        self.pump(now, table);
+        self.dispatch_all(now, table);
         self.is_fresh = false;
     }
 
@@ -378,7 +378,7 @@ impl Lane {
             }
             Report::Moved => self.receiver_moved(now, index, table),
         }
-        self.pump(now, table);
+        self.dispatch_all(now, table);
     }
 
     /// Takes a letter back after a report, which may have arrived before the conclusion of the
@@ -448,7 +448,7 @@ impl Lane {
     pub(crate) fn directory_changed(&mut self, now: Instant, table: &mut AttemptTable) {
         self.check_next_hops(now, table);
         self.notice_end(now, table);
-        self.pump(now, table);
+        self.dispatch_all(now, table);
     }
 
     /// Ends attempts and custody at services that no longer lead to the receiver, according to the

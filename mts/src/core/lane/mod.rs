@@ -17,9 +17,9 @@
 
 mod answers;
 mod clock;
-mod custody;
 mod open_letter;
 mod pause;
+mod predecessors;
 mod tried;
 mod trust;
 mod turns;
@@ -34,11 +34,11 @@ use fipa_transport::{
     TransportError, TransportErrorKind,
 };
 
-use self::custody::PastLetters;
 pub(crate) use self::open_letter::OpenLetter;
 use self::open_letter::State;
 use self::pause::Pause;
 pub(crate) use self::pause::PauseEnd;
+use self::predecessors::PastLetters;
 use super::attempts::{AttemptTable, Purpose};
 use super::ids::{LaneId, LaneKey, registration_of};
 use super::label::PredecessorNote;
@@ -372,7 +372,7 @@ impl Lane {
     }
 
     /// Dispatches all letters that can be dispatched.
-    pub(crate) fn pump(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(crate) fn dispatch_all(&mut self, now: Instant, table: &mut AttemptTable) {
         self.active = now;
         if !self.expire(now, table) {
             return;

@@ -139,7 +139,7 @@ impl Lane {
     /// Continues after an event that may have ended the pause.
     pub(crate) fn resume(&mut self, now: Instant, event: PauseEnd, table: &mut AttemptTable) {
         if self.end_pause(event) {
-            self.pump(now, table);
+            self.dispatch_all(now, table);
         }
     }
 
@@ -150,7 +150,7 @@ impl Lane {
             && rules::credit_counts(self.has_settled);
         if counts && self.end_pause(PauseEnd::Credit) {
             self.has_settled = false;
-            self.pump(now, table);
+            self.dispatch_all(now, table);
         }
     }
 }

@@ -44,7 +44,7 @@ impl Lane {
                 State::Waiting(_) | State::Ended => self.refuse(now, index, &entry, table),
             }
         }
-        self.pump(now, table);
+        self.dispatch_all(now, table);
     }
 
     /// Ends a letter for an agent of a service whose certificate is no longer trusted.

@@ -7,14 +7,14 @@ use crate::Map;
 
 /// The bytes of the letters in all lanes.
 #[derive(Debug, Default)]
-pub(crate) struct CustodyBudget {
+pub(crate) struct LaneBudget {
     /// Total.
     held: usize,
     /// At a gateway, the bytes for each receiver.
     held_for: Map<Arc<str>, usize>,
 }
 
-impl CustodyBudget {
+impl LaneBudget {
     /// The bytes of the letters in all lanes.
     pub(crate) fn held(&self) -> usize {
         self.held

@@ -24,7 +24,7 @@ const LOST_CHECK: Duration = Duration::from_secs(15);
 
 /// Publishes the agents of other hosts to the processes of this host, as reachable through this
 /// gateway.
-pub(super) struct Publisher {
+pub(super) struct DirectorySync {
     pub(super) host: Arc<HostDirectory>,
     /// The directory that announces the agents of this host, if there is one.
     pub(super) network: Option<Arc<dyn Directory>>,
@@ -39,7 +39,7 @@ pub(super) struct Publisher {
     pub(super) pace: Mutex<PublishPace>,
 }
 
-impl Publisher {
+impl DirectorySync {
     /// Returns the locations that other hosts can use. A loopback address is none of them, because
     /// on another host it leads to that host.
     fn announced_locations(&self) -> Vec<Location> {
@@ -105,8 +105,8 @@ impl Publisher {
 }
 
 /// The task that keeps announcements and published entries up to date.
-pub(super) struct PublishTask {
-    publisher: Arc<Publisher>,
+pub(super) struct DirectorySyncTask {
+    publisher: Arc<DirectorySync>,
     network: Option<Arc<dyn Network>>,
     /// The announced agents, by name.
     announced: HashMap<Arc<str>, Arc<Entry>>,
@@ -116,8 +116,8 @@ pub(super) struct PublishTask {
     refused: HashMap<Arc<str>, Incarnation>,
 }
 
-impl PublishTask {
-    pub(super) fn new(publisher: Arc<Publisher>, network: Option<Arc<dyn Network>>) -> Self {
+impl DirectorySyncTask {
+    pub(super) fn new(publisher: Arc<DirectorySync>, network: Option<Arc<dyn Network>>) -> Self {
         Self {
             publisher,
             network,

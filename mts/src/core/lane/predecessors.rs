@@ -52,7 +52,7 @@ impl Lane {
         open_letter.custody_taken(table);
         open_letter.add_upstream(upstream);
         self.lower_predecessor(index, label.after, table);
-        self.pump(now, table);
+        self.dispatch_all(now, table);
         Ok(())
     }
 
@@ -69,7 +69,7 @@ impl Lane {
         let index = self.index(note.sequence);
         let index = index.filter(|index| self.letters[*index].came_from(from, note.transfer))?;
         self.lower_predecessor(index, note.after, table);
-        self.pump(now, table);
+        self.dispatch_all(now, table);
         Some(match self.busy {
             true => Answer::Busy,
             false => Answer::Accepted,
@@ -152,7 +152,7 @@ impl Lane {
             self.custodian_lost(now, index, text, table);
             // It may have lost others, too.
             self.ask_custodian_at(now + ASK_CUSTODIAN_ON);
-            self.pump(now, table);
+            self.dispatch_all(now, table);
         }
     }
 

@@ -1,4 +1,4 @@
-//! Letters for agents of other processes: the gateway's role.
+//! Letters for agents of other processes, which a gateway takes into custody.
 
 use std::time::{Duration, Instant};
 
