@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use clap::error::{ContextKind, ContextValue};
 use clap::{
     ArgAction, ArgMatches, Args, Command as Clap, CommandFactory, FromArgMatches, Parser, ValueHint,
 };
@@ -45,7 +46,7 @@ impl CommandLine {
     /// when the option is also given after it.
     pub(crate) fn read() -> Self {
         let matches = command().try_get_matches();
-        let matches = matches.unwrap_or_else(|error| report::usage(&error));
+        let matches = matches.unwrap_or_else(|error| report::usage(&with_meant_command(error)));
         let read = || {
             let mut line = Self::from_arg_matches(&matches)?;
             line.global = Global::of(&matches)?;
@@ -53,6 +54,31 @@ impl CommandLine {
         };
         read().unwrap_or_else(|error: clap::Error| report::usage(&error))
     }
+}
+
+/// Names the command that has another name in other tools, instead of one that is spelled alike.
+fn with_meant_command(mut error: clap::Error) -> clap::Error {
+    let word = match error.get(ContextKind::InvalidSubcommand) {
+        Some(ContextValue::String(word)) => word.as_str(),
+        _ => return error,
+    };
+    let meant: &[&str] = match word {
+        "topic" | "topics" | "pub" => &["publish", "subscribe"],
+        "sub" => &["subscribe"],
+        "list" | "ls" | "ps" | "node" | "nodes" | "info" | "status" => &["agents"],
+        "service" | "services" | "call" => &["request", "df"],
+        "action" => &["actions"],
+        "param" | "params" | "set" => &["config"],
+        "record" | "bag" | "log" | "monitor" => &["watch"],
+        "start" | "run" | "daemon" | "gateway" | "serve" => &["up"],
+        _ => return error,
+    };
+    let meant = meant.iter().map(|command| (*command).to_owned()).collect();
+    error.insert(
+        ContextKind::SuggestedSubcommand,
+        ContextValue::Strings(meant),
+    );
+    error
 }
 
 /// Builds the command line with its global options.

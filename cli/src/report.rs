@@ -3,7 +3,7 @@
 use std::env;
 use std::ffi::OsString;
 use std::fmt::Write as _;
-use std::io::{self, Write as _};
+use std::io::{self, IsTerminal as _, Write as _};
 use std::process::{self, ExitCode};
 
 use fipa::Performative;
@@ -164,6 +164,13 @@ pub(crate) fn warn(text: &str) {
 /// Tells the user about the course of the command.
 pub(crate) fn note(text: &str) {
     to_stderr(&format!("{}\n", indented(text)));
+}
+
+/// Tells a person at a terminal what the command is doing, beside its output.
+pub(crate) fn hint(text: &str) {
+    if io::stderr().is_terminal() {
+        note(text);
+    }
 }
 
 /// Warns of each user-defined performative that differs from one of FIPA by a typing error. User-defined

@@ -7,6 +7,7 @@ mod common;
 
 use std::env;
 use std::fs;
+use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::thread;
@@ -248,10 +249,10 @@ fn subscribe_prints_notifications_until_its_end() {
     let printed = host
         .run(&["subscribe", "battery", "charge", "--count", "2"])
         .done();
-    let lines: Vec<&str> = printed.lines().collect();
-    assert_eq!(lines[0], "subscribed to battery; press Ctrl-C to stop");
-    assert_eq!(lines.len(), 3, "{printed}");
-    assert!(lines[1].contains(":content \"80.5\""), "{printed}");
+    assert_eq!(printed, "80.5\n80.5\n");
+    let full = ["subscribe", "battery", "charge", "--count", "1", "--full"];
+    let printed = host.run(&full).done();
+    assert!(printed.contains(":content \"80.5\""), "{printed}");
 
     let mut subscription = host.start(&["subscribe", "battery", "charge", "--json"]);
     assert_eq!(subscription.ready, "{\"subscribed\":\"battery\"}");
@@ -259,8 +260,100 @@ fn subscribe_prints_notifications_until_its_end() {
     assert_eq!(line["notification"]["content"], "80.5");
     assert_eq!(subscription.signal("-INT"), (Some(0), String::new()));
 
-    let nothing = ["subscribe", "battery", "voltage", "--timeout", "100ms"];
-    assert!(host.run(&nothing).failed(1).starts_with("error: "));
+    let unknown = host.run(&["subscribe", "battery", "voltage"]).failed(1);
+    assert!(unknown.contains("topics: charge"), "{unknown}");
+}
+
+#[test]
+fn publish_gives_each_subscriber_the_newest_value() {
+    let host = Host::new();
+    let publish = ["publish", "battery", "charge", "80.5"];
+    let publishing = host.start(&publish);
+    let ready = "publishing charge as battery; press Ctrl-C to stop";
+    assert_eq!(publishing.ready, ready);
+    for _ in 0..2 {
+        let subscribe = ["subscribe", "battery", "charge", "--count", "1"];
+        assert_eq!(host.run(&subscribe).done(), "80.5\n");
+    }
+    assert_eq!(publishing.signal("-INT"), (Some(0), String::new()));
+
+    // Bytes of a file arrive unchanged.
+    let image: Vec<u8> = (0..=255).cycle().take(100_000).collect();
+    let file = host.path("image");
+    fs::write(&file, &image).unwrap();
+    let file = file.to_str().unwrap();
+    let publish = ["publish", "camera", "image", "--content-file", file];
+    let publishing = host.start(&[&publish[..], &["--rate", "100", "--json"]].concat());
+    let mut subscribe = host.command(&["subscribe", "camera", "image", "--raw", "--count", "2"]);
+    let received = subscribe.output().unwrap();
+    assert!(received.status.success(), "{received:?}");
+    assert!(received.stdout == [&image[..], &image].concat());
+    let (code, _) = publishing.signal("-INT");
+    assert_eq!(code, Some(0));
+}
+
+#[test]
+fn publish_sends_the_lines_of_its_input_and_ends_with_it() {
+    let host = Host::new();
+    let mut publish = host.command(&["publish", "door", "events", "-", "--json"]);
+    let mut publish = publish
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(publish.stdout.take().unwrap()).lines();
+    assert!(
+        lines
+            .next()
+            .unwrap()
+            .unwrap()
+            .contains("\"publishing\":\"events\"")
+    );
+    let mut subscription = host.start(&["subscribe", "door", "events", "--json"]);
+    let mut input = publish.stdin.take().unwrap();
+    input.write_all(b"opened\nclosed\nlast").unwrap();
+    drop(input);
+    for (content, number) in [("opened", 1), ("closed", 2), ("last", 3)] {
+        let line: Value = serde_json::from_str(&subscription.line()).unwrap();
+        let notification = &line["notification"];
+        assert_eq!(notification["content"], content, "{number}");
+        assert_eq!(line["missed"], 0);
+        assert!(line["age_ms"].is_u64(), "{line}");
+    }
+    assert!(publish.wait().unwrap().success());
+    let last = lines.last().unwrap().unwrap();
+    let last: Value = serde_json::from_str(&last).unwrap();
+    assert_eq!(
+        (&last["published"], &last["delivered"]),
+        (&json!(3), &json!(3))
+    );
+}
+
+#[test]
+fn the_receiver_and_the_content_of_send_need_no_options() {
+    let host = Host::new();
+    let mut listen = host.start(&["listen", "arm_1"]);
+    host.run(&["send", "arm_1", "hello"]).done();
+    assert!(listen.line().contains(":content \"hello\""));
+    host.run(&["send", "arm_1", "--", "-1"]).done();
+    assert!(listen.line().contains(":content \"-1\""));
+    let twice = host.run(&["send", "--to", "arm_1", "hello"]).failed(2);
+    assert!(twice.contains("fipa send NAME TEXT"), "{twice}");
+    host.run(&["send"]).failed(2);
+}
+
+#[test]
+fn words_of_other_tools_lead_to_the_command() {
+    let host = Host::new();
+    for (word, command) in [
+        ("topics", "'publish', 'subscribe'"),
+        ("list", "'agents'"),
+        ("ps", "'agents'"),
+        ("node", "'agents'"),
+    ] {
+        let error = host.run(&[word]).failed(2);
+        assert!(error.contains(command), "{word}: {error}");
+    }
 }
 
 #[test]

@@ -145,8 +145,11 @@ impl TestProcess {
     }
 }
 
-/// Maximum number of segments of a process.
+/// Maximum number of idle segments of a process.
 const SEGMENTS: usize = 8;
+
+/// Maximum number of segments of other processes that a process keeps open.
+const OPEN_SEGMENTS: usize = 32;
 
 /// The resources that the survivors of a domain use.
 #[derive(Debug, PartialEq, Eq)]
@@ -436,7 +439,8 @@ impl Cluster {
         self.quit_process(new_process);
         let start = self.start.as_ref().unwrap();
         // Segments are kept for reuse, and those of the other survivor are kept open.
-        let most = start.descriptors.iter().map(|count| count + 2 * SEGMENTS);
+        let kept = SEGMENTS + OPEN_SEGMENTS;
+        let most = start.descriptors.iter().map(|count| count + kept);
         let most: Vec<usize> = most.collect();
         // A gateway leaves its state to its successor.
         let resource_use = || {

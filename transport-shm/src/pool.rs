@@ -17,6 +17,9 @@ use crate::segment::{ContentReference, SegmentFile};
 /// Maximum number of segments of a process. Each receiver that is stopped may hold one.
 const MAX_SEGMENTS: usize = 64;
 
+/// Maximum number of idle segments of a process.
+const MAX_IDLE: usize = 8;
+
 /// Fraction of the domain's capacity, as a divisor, that idle segments of a process may use. The
 /// next content then finds its pages allocated.
 const IDLE_PART: u64 = 16;
@@ -196,13 +199,14 @@ impl Pool {
         if state.closed {
             return;
         }
-        let idle = state.slots.iter().filter(|slot| slot.is_idle());
-        let idle: u64 = idle.map(Slot::size).sum();
-        let mut beyond = idle.saturating_sub(self.budget.capacity() / IDLE_PART);
+        let idle = || state.slots.iter().filter(|slot| slot.is_idle());
+        let size: u64 = idle().map(Slot::size).sum();
+        let mut beyond = size.saturating_sub(self.budget.capacity() / IDLE_PART);
+        let mut too_many = idle().count().saturating_sub(MAX_IDLE);
         let mut waiting = false;
         state.slots.sort_by_key(|slot| Reverse(slot.size()));
         state.slots.retain(|slot| {
-            if beyond == 0 || !slot.is_idle() {
+            if (beyond == 0 && too_many == 0) || !slot.is_idle() {
                 return true;
             }
             // Requested first, so that a reader either has stopped or will ring.
@@ -211,6 +215,7 @@ impl Pool {
             waiting |= !empty;
             if empty {
                 beyond = beyond.saturating_sub(slot.size());
+                too_many = too_many.saturating_sub(1);
             }
             !empty
         });

@@ -109,7 +109,7 @@ async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result
     match arguments.json {
         true => output::json_line(&json!({ "subscribed": name.name() }))?,
         // The output has the contents alone.
-        false => report::note(&format!(
+        false => report::hint(&format!(
             "subscribed to {}; press Ctrl-C to stop",
             escape_name(name.name())
         )),
