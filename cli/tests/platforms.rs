@@ -375,7 +375,7 @@ fn an_agent_that_no_directory_lists_is_reached_at_a_stated_address() {
     arguments.extend(two.map(str::to_owned));
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let sent = host.run(&arguments).done();
-    assert!(sent.contains("\"delivered\":1,\"failed\":0"), "{sent}");
+    assert!(sent.contains("\"sent\":1"), "{sent}");
     reading.join().unwrap();
     for command in ["request", "subscribe", "ping", "do"] {
         let help = host.run(&[command, "--help"]).done();

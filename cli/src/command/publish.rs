@@ -221,11 +221,14 @@ fn lines_of_input() -> Result<mpsc::Receiver<io::Result<Vec<u8>>>, Failure> {
             if line.last() == Some(&b'\n') {
                 line.pop();
             }
-            let is_over = !matches!(read, Ok(1..));
-            if (is_over && read.is_ok())
-                || sender.blocking_send(read.map(|_| line)).is_err()
-                || is_over
-            {
+            let line = match read {
+                Ok(0) => return,
+                Ok(_) => Ok(line),
+                Err(error) => Err(error),
+            };
+            let is_last = line.is_err();
+            // Without a receiver, the command has ended.
+            if sender.blocking_send(line).is_err() || is_last {
                 return;
             }
         }
