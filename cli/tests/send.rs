@@ -459,21 +459,6 @@ fn an_invalid_command_line_has_exit_code_2() {
 }
 
 #[test]
-fn a_receiver_or_content_without_its_option_is_refused_with_the_options() {
-    let host = Host::new();
-    for wrong in [
-        &["send", "arm_1", "hello"][..],
-        &["send", "--to", "arm_1", "hello"],
-    ] {
-        let output = host.run(wrong).failed(2);
-        let remedy = "`fipa send --to NAME --content TEXT`";
-        assert!(output.contains(remedy), "{wrong:?}: {output}");
-    }
-    let help = host.run(&["send", "--help"]).done();
-    assert!(!help.contains("WORD]"), "{help}");
-}
-
-#[test]
 fn no_files_are_left_behind() {
     let host = Host::new();
     let echo = host.echo("arm_1");
