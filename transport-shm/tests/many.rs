@@ -74,10 +74,10 @@ fn new_content_does_not_wait_for_readers_and_reuses_unread_segments() {
     let domain = TestDomain::new();
     let (sender, sink) = domain.listening();
     let (receiver, got) = domain.listening();
-    for round in 0..8 {
+    for round in 0..64 {
         send(&sender, &sink, &receiver, &content(&sender, 100_000, round));
     }
-    assert_eq!(segments(&domain).0, 8);
+    assert_eq!(segments(&domain).0, 64);
     // The receiver holds the maximum number of contents.
     let refused = sender
         .loan_for_many(100_000)
@@ -85,17 +85,17 @@ fn new_content_does_not_wait_for_readers_and_reuses_unread_segments() {
         .expect("the limit is reached");
     assert_eq!(refused.fault, TransportErrorKind::Congested, "{refused}");
     // Content outside of a segment is copied.
-    let copied = Bytes::from(vec![8; 100_000]);
+    let copied = Bytes::from(vec![64; 100_000]);
     assert!(sender.copies_for_each(&copied));
     send(&sender, &sink, &receiver, &copied);
-    for round in 0..9_u8 {
+    for round in 0..65_u8 {
         assert_eq!(got.content(usize::from(round)), vec![round; 100_000]);
     }
     got.arrived.lock().unwrap().remove(3);
     let next = content(&sender, 90_000, 77);
     send(&sender, &sink, &receiver, &next);
-    assert_eq!(segments(&domain).0, 8);
-    assert_eq!(got.content(8), vec![77; 90_000]);
+    assert_eq!(segments(&domain).0, 64);
+    assert_eq!(got.content(64), vec![77; 90_000]);
     // Short content is not put into a segment.
     assert!(sender.loan_for_many(100).unwrap().is_none());
     assert!(!sender.copies_for_each(&Bytes::from(vec![1; 100])));
