@@ -1,8 +1,5 @@
 //! Contents of messages (FIPA00008 clause 3.1).
 
-use crate::SlDialect;
-use crate::error::ParseError;
-use crate::parse::Parser;
 use crate::term::{ActionExpression, IdentifyingExpression};
 use crate::wff::Wff;
 
@@ -35,26 +32,6 @@ impl<'a> Content<'a> {
         Self {
             expressions: expressions.into_iter().map(Into::into).collect(),
         }
-    }
-
-    /// Parses a content in the standard notation.
-    ///
-    /// # Errors
-    /// When the bytes are not one content, are nested deeper than [`MAX_DEPTH`](crate::MAX_DEPTH),
-    /// or have more than [`MAX_NODES`](crate::MAX_NODES) terms and formulas.
-    pub fn parse(bytes: &'a (impl AsRef<[u8]> + ?Sized)) -> Result<Self, ParseError> {
-        Self::parse_in(SlDialect::Standard, bytes)
-    }
-
-    /// Parses a content that comes from a writer of this dialect.
-    ///
-    /// # Errors
-    /// See [`parse`](Self::parse).
-    pub fn parse_in(
-        dialect: SlDialect,
-        bytes: &'a (impl AsRef<[u8]> + ?Sized),
-    ) -> Result<Self, ParseError> {
-        Parser::whole(dialect, bytes.as_ref(), Parser::content)
     }
 
     /// Returns the same content with owned text.

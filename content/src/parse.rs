@@ -13,6 +13,38 @@ use crate::term::{
 use crate::wff::{LogicalOperator, ModalOperator, Quantifier, Wff};
 use crate::{MAX_DEPTH, MAX_NODES, SlDialect};
 
+/// Defines the functions of a type that parse a whole text.
+macro_rules! parse_functions {
+    ($type:ident, $what:literal, $read:path) => {
+        impl<'a> $type<'a> {
+            #[doc = concat!("Parses one ", $what, " in the standard notation.")]
+            ///
+            /// # Errors
+            #[doc = concat!("When the bytes are not one ", $what, ", are nested deeper than")]
+            /// [`MAX_DEPTH`](crate::MAX_DEPTH), or have more than [`MAX_NODES`](crate::MAX_NODES)
+            /// terms and formulas.
+            pub fn parse(bytes: &'a (impl AsRef<[u8]> + ?Sized)) -> Result<Self, ParseError> {
+                Self::parse_in(SlDialect::Standard, bytes)
+            }
+
+            #[doc = concat!("Parses one ", $what, " that comes from a writer of this dialect.")]
+            ///
+            /// # Errors
+            /// See [`parse`](Self::parse).
+            pub fn parse_in(
+                dialect: SlDialect,
+                bytes: &'a (impl AsRef<[u8]> + ?Sized),
+            ) -> Result<Self, ParseError> {
+                Parser::whole(dialect, bytes.as_ref(), $read)
+            }
+        }
+    };
+}
+
+parse_functions!(Content, "content", Parser::content);
+parse_functions!(Term, "term", Parser::term);
+parse_functions!(Wff, "formula", Parser::wff);
+
 const CONTENT: &str = "FIPA00008 Content";
 const EXPRESSION: &str = "FIPA00008 ContentExpression";
 const WFF: &str = "FIPA00008 Wff";

@@ -4,11 +4,9 @@ use std::borrow::Cow;
 
 use fipa_acl::Time;
 
-use crate::error::ParseError;
+use crate::into_owned;
 use crate::number::Number;
-use crate::parse::Parser;
 use crate::wff::Wff;
-use crate::{SlDialect, into_owned};
 
 /// A term (FIPA00008 `TermOrIE`).
 ///
@@ -129,26 +127,6 @@ pub struct IdentifyingExpression<'a> {
 }
 
 impl<'a> Term<'a> {
-    /// Parses one term in the standard notation.
-    ///
-    /// # Errors
-    /// When the bytes are not one term, are nested deeper than [`MAX_DEPTH`](crate::MAX_DEPTH), or
-    /// have more than [`MAX_NODES`](crate::MAX_NODES) terms and formulas.
-    pub fn parse(bytes: &'a (impl AsRef<[u8]> + ?Sized)) -> Result<Self, ParseError> {
-        Self::parse_in(SlDialect::Standard, bytes)
-    }
-
-    /// Parses one term that comes from a writer of this dialect.
-    ///
-    /// # Errors
-    /// See [`parse`](Self::parse).
-    pub fn parse_in(
-        dialect: SlDialect,
-        bytes: &'a (impl AsRef<[u8]> + ?Sized),
-    ) -> Result<Self, ParseError> {
-        Parser::whole(dialect, bytes.as_ref(), Parser::term)
-    }
-
     /// Returns the same term with owned text.
     #[must_use]
     pub fn into_owned(self) -> Term<'static> {

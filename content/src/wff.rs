@@ -2,10 +2,8 @@
 
 use std::borrow::Cow;
 
-use crate::error::ParseError;
-use crate::parse::Parser;
+use crate::into_owned;
 use crate::term::{ActionExpression, Term, owned_terms};
-use crate::{SlDialect, into_owned};
 
 /// A well-formed formula (FIPA00008 `Wff`).
 #[derive(Debug, Clone, PartialEq)]
@@ -130,26 +128,6 @@ keywords! {
 }
 
 impl<'a> Wff<'a> {
-    /// Parses one formula in the standard notation.
-    ///
-    /// # Errors
-    /// When the bytes are not one formula, are nested deeper than [`MAX_DEPTH`](crate::MAX_DEPTH),
-    /// or have more than [`MAX_NODES`](crate::MAX_NODES) terms and formulas.
-    pub fn parse(bytes: &'a (impl AsRef<[u8]> + ?Sized)) -> Result<Self, ParseError> {
-        Self::parse_in(SlDialect::Standard, bytes)
-    }
-
-    /// Parses one formula that comes from a writer of this dialect.
-    ///
-    /// # Errors
-    /// See [`parse`](Self::parse).
-    pub fn parse_in(
-        dialect: SlDialect,
-        bytes: &'a (impl AsRef<[u8]> + ?Sized),
-    ) -> Result<Self, ParseError> {
-        Parser::whole(dialect, bytes.as_ref(), Parser::wff)
-    }
-
     /// Returns a predicate, or a proposition if there are no arguments.
     #[must_use]
     pub fn predicate(

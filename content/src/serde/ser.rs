@@ -92,6 +92,30 @@ impl Serializer {
         self.out.extend_from_slice(text.as_bytes());
     }
 
+    #[inline]
+    fn put_integer(&mut self, value: impl itoa::Integer) -> Result {
+        self.put(itoa::Buffer::new().format(value));
+        Ok(())
+    }
+
+    /// Appends an integer that may be too long for JADE.
+    #[inline]
+    fn put_long_integer(&mut self, value: impl itoa::Integer + Copy + TryInto<i64>) -> Result {
+        if self.dialect == SlDialect::Jade && value.try_into().is_err() {
+            return Err(too_large_for_jade().into());
+        }
+        self.put_integer(value)
+    }
+
+    #[inline]
+    fn put_float<F: zmij::Float + Copy + Into<f64>>(&mut self, value: F) -> Result {
+        if !value.into().is_finite() {
+            return Err(SerializeError::NotFinite.into());
+        }
+        self.put(zmij::Buffer::new().format_finite(value));
+        Ok(())
+    }
+
     fn open(&mut self) -> Result {
         // A mode applies to a collection or a text, not to the parts of another term.
         self.mode = Mode::Plain;
@@ -165,38 +189,12 @@ fn too_large_for_jade() -> SerializeError {
     })
 }
 
-macro_rules! integers {
-    ($($method:ident $integer:ty,)*) => {$(
+/// Defines the methods of a serializer that write numbers with the same method.
+macro_rules! numbers {
+    ($put:ident: $($method:ident $number:ty,)*) => {$(
         #[inline]
-        fn $method(self, value: $integer) -> Result {
-            self.put(itoa::Buffer::new().format(value));
-            Ok(())
-        }
-    )*};
-}
-
-macro_rules! long_integers {
-    ($($method:ident $integer:ty,)*) => {$(
-        #[inline]
-        fn $method(self, value: $integer) -> Result {
-            if self.dialect == SlDialect::Jade && i64::try_from(value).is_err() {
-                return Err(too_large_for_jade().into());
-            }
-            self.put(itoa::Buffer::new().format(value));
-            Ok(())
-        }
-    )*};
-}
-
-macro_rules! floats {
-    ($($method:ident $float:ty,)*) => {$(
-        #[inline]
-        fn $method(self, value: $float) -> Result {
-            if !value.is_finite() {
-                return Err(SerializeError::NotFinite.into());
-            }
-            self.put(zmij::Buffer::new().format_finite(value));
-            Ok(())
+        fn $method(self, value: $number) -> Result {
+            self.$put(value)
         }
     )*};
 }
@@ -212,7 +210,8 @@ impl<'s> ser::Serializer for &'s mut Serializer {
     type SerializeStruct = Compound<'s>;
     type SerializeStructVariant = Compound<'s>;
 
-    integers! {
+    numbers! {
+        put_integer:
         serialize_i8 i8,
         serialize_i16 i16,
         serialize_i32 i32,
@@ -222,13 +221,15 @@ impl<'s> ser::Serializer for &'s mut Serializer {
         serialize_u32 u32,
     }
 
-    long_integers! {
+    numbers! {
+        put_long_integer:
         serialize_u64 u64,
         serialize_i128 i128,
         serialize_u128 u128,
     }
 
-    floats! {
+    numbers! {
+        put_float:
         serialize_f32 f32,
         serialize_f64 f64,
     }
