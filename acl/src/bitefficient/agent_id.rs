@@ -2,31 +2,49 @@
 
 use crate::bitefficient::code;
 use crate::bitefficient::expression::expression;
+use crate::bitefficient::identifier::{self, Notation};
 use crate::bitefficient::notes::{self, Notes};
 use crate::bitefficient::reader::Reader;
 use crate::error::{DecodeError, Problem};
 use crate::scan::Kind;
-use crate::view::{AgentIdView, AgentIds, Encoding, List, Part, check_name};
+use crate::view::{AgentIdView, AgentIds, Encoding};
 use crate::word::is_token;
 use crate::{AgentId, Text};
 
-const CLAUSE: &str = "FIPA00069 2.2 AgentIdentifier";
+/// The notation in messages (FIPA00069 2.2 `AgentIdentifier`).
+pub(crate) struct InMessages;
 
-/// Reads the next identifier of a sequence. The bytes have been checked before.
-pub(crate) fn next<'a>(rest: &mut &'a [u8]) -> Option<AgentIdView<'a>> {
-    (!rest.is_empty()).then_some(())?;
-    let mut reader = Reader::new(rest);
-    let agent = agent_id(&mut reader, AgentId::MAX_DEPTH).ok();
-    *rest = agent.map_or(&[], |_| reader.rest());
-    agent
-}
+impl Notation for InMessages {
+    const ENCODING: Encoding = Encoding::BitEfficient;
+    const CLAUSE: &'static str = "FIPA00069 2.2 AgentIdentifier";
 
-/// Reads the next part of a checked identifier.
-pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part<'a>> {
-    let mut reader = Reader::new(rest);
-    let part = part(&mut reader, list, AgentId::MAX_DEPTH).ok().flatten();
-    *rest = reader.rest();
-    part
+    #[inline(always)]
+    fn short_name<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Option<&'a [u8]> {
+        reader.short_agent_name()
+    }
+
+    #[inline(always)]
+    fn text<'a, N: Notes>(
+        reader: &mut Reader<'a, N>,
+        what: &'static str,
+    ) -> Result<Text<'a>, DecodeError> {
+        word(reader, what).map(Text::plain)
+    }
+
+    fn noted(text: &Text<'_>) -> String {
+        notes::quoted(&text.as_str())
+    }
+
+    #[inline]
+    fn user_defined<'a, N: Notes>(
+        reader: &mut Reader<'a, N>,
+        id: u8,
+    ) -> Result<Option<(Text<'a>, Text<'a>)>, DecodeError> {
+        match id {
+            code::agent::USER_DEFINED => user_defined(reader).map(Some),
+            _ => Ok(None),
+        }
+    }
 }
 
 /// Reads an agent identifier with resolvers nested at most `depth` deep.
@@ -35,37 +53,7 @@ pub(crate) fn agent_id<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<AgentIdView<'a>, DecodeError> {
-    // The fast path takes no notes.
-    if !N::ENABLED
-        && let Some(name) = reader.short_agent_name()
-    {
-        let (name, end) = (Text::plain(name), &[code::END]);
-        return Ok(AgentIdView::new(name, Encoding::BitEfficient, end));
-    }
-    agent_id_slow(reader, depth)
-}
-
-#[inline(never)]
-fn agent_id_slow<'a, N: Notes>(
-    reader: &mut Reader<'a, N>,
-    depth: usize,
-) -> Result<AgentIdView<'a>, DecodeError> {
-    let first = reader.byte(CLAUSE, "an agent identifier")?;
-    if first != code::agent::BEGIN {
-        return Err(reader.unexpected(CLAUSE, first, "an agent identifier"));
-    }
-    let offset = reader.offset();
-    let name = Text::plain(word(reader, "agent name")?);
-    check_name(&name, "agent name").map_err(|problem| DecodeError::new(offset, CLAUSE, problem))?;
-    reader.note(|| format!("agent identifier: name {}", notes::quoted(&name.as_str())));
-    reader.notes().deeper();
-    let start = reader.position();
-    let mut list = List::Outside;
-    while part(reader, &mut list, depth)?.is_some() {}
-    reader.notes().shallower();
-    reader.note(|| "end of agent identifier".to_owned());
-    let parts = reader.since(start);
-    Ok(AgentIdView::new(name, Encoding::BitEfficient, parts))
+    identifier::agent_id::<InMessages, N>(reader, depth)
 }
 
 /// Reads the agent identifiers of a set, including its end.
@@ -89,73 +77,6 @@ fn agent_ids_slow<'a, N: Notes>(
 ) -> Result<AgentIds<'a>, DecodeError> {
     let members = reader.set(set, |reader| agent_id(reader, AgentId::MAX_DEPTH))?;
     Ok(AgentIds::new(Encoding::BitEfficient, members))
-}
-
-/// Reads the next part of an identifier with resolvers nested at most `depth` deep. Returns `None`
-/// at its end.
-fn part<'a, N: Notes>(
-    reader: &mut Reader<'a, N>,
-    list: &mut List,
-    depth: usize,
-) -> Result<Option<Part<'a>>, DecodeError> {
-    loop {
-        list.end(reader);
-        match list {
-            List::Addresses => return address(reader).map(Some),
-            List::Resolvers => {
-                let Some(depth) = depth.checked_sub(1) else {
-                    return Err(reader.error(CLAUSE, Problem::TooDeep("resolvers")));
-                };
-                return Ok(Some(Part::Resolver(agent_id(reader, depth)?)));
-            }
-            List::Outside => {}
-        }
-        match reader.byte(CLAUSE, "an agent identifier")? {
-            code::END => return Ok(None),
-            code::agent::ADDRESSES => list.begin(List::Addresses, reader),
-            code::agent::RESOLVERS => list.begin(List::Resolvers, reader),
-            code::agent::USER_DEFINED => {
-                let (name, value) = user_defined(reader)?;
-                return Ok(Some(Part::UserDefined(name, value)));
-            }
-            other => return Err(reader.unexpected(CLAUSE, other, "a part of an agent identifier")),
-        }
-    }
-}
-
-/// Both bit-efficient encodings begin a list with its code and end it with [`code::END`].
-impl List {
-    pub(crate) fn begin<N: Notes>(&mut self, list: Self, reader: &mut Reader<'_, N>) {
-        *self = list;
-        reader.note(|| list.name().to_owned());
-        reader.notes().deeper();
-    }
-
-    /// Leaves the list if the next byte ends it.
-    pub(crate) fn end<N: Notes>(&mut self, reader: &mut Reader<'_, N>) {
-        if *self != Self::Outside && reader.take_if(code::END) {
-            reader.notes().shallower();
-            reader.note(|| format!("end of {}", self.name()));
-            *self = Self::Outside;
-        }
-    }
-
-    fn name(self) -> &'static str {
-        match self {
-            Self::Outside => "",
-            Self::Addresses => "addresses",
-            Self::Resolvers => "resolvers",
-        }
-    }
-}
-
-fn address<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Part<'a>, DecodeError> {
-    let address = Text::plain(word(reader, "address")?);
-    if address.is_empty() {
-        return Err(reader.error(CLAUSE, Problem::Empty("address")));
-    }
-    reader.note(|| format!("address {}", notes::quoted(&address.as_str())));
-    Ok(Part::Address(address))
 }
 
 /// Reads a `BinWord`.

@@ -11,6 +11,7 @@ pub(crate) mod code;
 mod code_table;
 pub(crate) mod dialects;
 pub(crate) mod expression;
+pub(crate) mod identifier;
 pub(crate) mod notes;
 pub(crate) mod reader;
 mod view;

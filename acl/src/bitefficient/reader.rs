@@ -376,7 +376,7 @@ impl<'a, N: Notes> Reader<'a, N> {
     fn short_date_time(&mut self) -> Option<Time> {
         let (&[id, first @ .., last], rest) = self.rest.split_first_chunk::<10>()?;
         let numbers = all_digits(first).filter(|numbers| Fields::are_common(*numbers))?;
-        let [century, year, month, day, hour, minute, second, tens] = numbers.to_le_bytes();
+        let [numbers @ .., tens] = numbers.to_le_bytes();
         let (0x10..=0xa0, 0) = (last & 0xf0, last & 0x0f) else {
             return None;
         };
@@ -386,15 +386,8 @@ impl<'a, N: Notes> Reader<'a, N> {
             _ => return None,
         };
         self.rest = rest;
-        let fields = Fields {
-            year: u16::from(century) * 100 + u16::from(year),
-            month,
-            day,
-            hour,
-            minute,
-            second,
-            millisecond: u16::from(tens) * 10 + u16::from(last >> 4) - 1,
-        };
+        let millisecond = u16::from(tens) * 10 + u16::from(last >> 4) - 1;
+        let fields = Fields::of_numbers(numbers, millisecond);
         let base = Base::Absolute;
         Some(Time { base, zone, fields })
     }
@@ -551,21 +544,13 @@ fn bin_date(digits: [u8; 9]) -> Option<Fields> {
             [two(y1)?, two(y2)?, a, b, c, d, e, two(m1)?]
         }
     };
-    let [century, year, month, day, hour, minute, second, tens] = numbers;
+    let [numbers @ .., tens] = numbers;
     let millisecond = if m2 & 0x0f == 0 {
         u16::from(tens) * 10 + u16::from(nibble(m2 >> 4)?)
     } else {
         u16::from(tens) * 100 + u16::from(two(m2)?)
     };
-    Some(Fields {
-        year: u16::from(century) * 100 + u16::from(year),
-        month,
-        day,
-        hour,
-        minute,
-        second,
-        millisecond,
-    })
+    Some(Fields::of_numbers(numbers, millisecond))
 }
 
 /// Decodes eight numbers of two digits each, if all nibbles are digits.

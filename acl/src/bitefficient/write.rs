@@ -4,7 +4,7 @@ use bytes::{BufMut, Bytes, BytesMut};
 
 use crate::bitefficient::code;
 use crate::error::EncodeError;
-use crate::time::{Base, Fields, Time, Zone};
+use crate::time::{Base, Time, Zone};
 use crate::word::{self, Piece, Shape, is_word};
 use crate::{AgentId, Message, Payload};
 
@@ -475,16 +475,10 @@ pub(crate) fn write_local_date_time(time: Time, out: &mut (impl Output + ?Sized)
 
 /// Writes the fields from year to second.
 fn write_seconds(time: Time, out: &mut (impl Output + ?Sized)) {
-    let Fields {
-        year,
-        month,
-        day,
-        hour,
-        minute,
-        second,
-        millisecond: _,
-    } = time.fields;
-    let [month, day, hour, minute, second] = [month, day, hour, minute, second].map(u16::from);
+    let of = time.fields;
+    let year = of.year;
+    let [month, day, hour, minute, second] =
+        [of.month, of.day, of.hour, of.minute, of.second].map(u16::from);
     let fields = [year / 100, year % 100, month, day, hour, minute, second];
     out.slice(&fields.map(two_digits));
 }

@@ -207,9 +207,7 @@ impl Time {
             }
         };
         if !fits || year > 9999 || millisecond > 999 {
-            return Err(TimeError::Range(format!(
-                "{year:04}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02}.{millisecond:03}"
-            )));
+            return Err(TimeError::Range(fields.date_and_time(' ')));
         }
         Ok(Self { base, zone, fields })
     }
@@ -237,19 +235,12 @@ impl Time {
 
     fn span(self) -> Duration {
         let Fields {
-            year,
-            month,
-            day,
-            hour,
-            minute,
-            second,
-            millisecond,
+            year, month, day, ..
         } = self.fields;
         let days =
             u64::from(year) * DAYS_PER_YEAR + u64::from(month) * DAYS_PER_MONTH + u64::from(day);
-        let seconds =
-            days * DAY + u64::from(hour) * 3600 + u64::from(minute) * 60 + u64::from(second);
-        Duration::from_secs(seconds) + Duration::from_millis(u64::from(millisecond))
+        let in_day = Duration::from_millis(self.fields.ms_of_day().into());
+        Duration::from_secs(days * DAY) + in_day
     }
 
     fn from_unix_ms(ms: i64) -> Result<Self, TimeError> {
@@ -275,22 +266,45 @@ impl Time {
     /// Milliseconds since 1970, with the zone taken as UTC.
     fn unix_ms(self) -> i64 {
         let Fields {
-            year,
+            year, month, day, ..
+        } = self.fields;
+        let days = days_from_civil(i64::from(year), month, day);
+        days * MS_PER_DAY + i64::from(self.fields.ms_of_day())
+    }
+}
+
+impl Fields {
+    /// The fields up to the second are, in this order: century, year of the century, month, day, hour,
+    /// minute, second.
+    #[inline]
+    pub(crate) fn of_numbers(numbers: [u8; 7], millisecond: u16) -> Self {
+        let [century, year, month, day, hour, minute, second] = numbers;
+        Self {
+            year: u16::from(century) * 100 + u16::from(year),
             month,
             day,
             hour,
             minute,
             second,
             millisecond,
-        } = self.fields;
-        let seconds = i64::from(hour) * 3600 + i64::from(minute) * 60 + i64::from(second);
-        days_from_civil(i64::from(year), month, day) * MS_PER_DAY
-            + seconds * 1000
-            + i64::from(millisecond)
+        }
     }
-}
 
-impl Fields {
+    /// Milliseconds since the beginning of the day.
+    fn ms_of_day(self) -> u32 {
+        let (hour, minute) = (u32::from(self.hour), u32::from(self.minute));
+        let seconds = hour * 3600 + minute * 60 + u32::from(self.second);
+        seconds * 1000 + u32::from(self.millisecond)
+    }
+
+    /// Formats the fields as RFC 3339 does, without a zone and with `between` in front of the hour.
+    fn date_and_time(self, between: char) -> String {
+        format!(
+            "{:04}-{:02}-{:02}{between}{:02}:{:02}:{:02}.{:03}",
+            self.year, self.month, self.day, self.hour, self.minute, self.second, self.millisecond
+        )
+    }
+
     /// Whether a time is in the common range: a valid month, a day up to 28, a valid hour and minute,
     /// and a second up to 59.
     ///

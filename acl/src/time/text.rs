@@ -15,18 +15,7 @@ impl Time {
         if self.is_relative() {
             return None;
         }
-        let Fields {
-            year,
-            month,
-            day,
-            hour,
-            minute,
-            second,
-            millisecond,
-        } = self.fields;
-        Some(format!(
-            "{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{millisecond:03}Z"
-        ))
+        Some(self.fields.date_and_time('T') + "Z")
     }
 
     /// Parses RFC 3339 text with any offset and any number of fractional digits, which are truncated
@@ -122,15 +111,9 @@ fn parse_common(text: &[u8]) -> Option<Time> {
     if !Fields::are_common(u64::from_le_bytes(numbers)) {
         return None;
     }
-    let fields = Fields {
-        year: u16::from(century) * 100 + u16::from(year),
-        month,
-        day,
-        hour,
-        minute,
-        second,
-        millisecond: u16::from(tens) * 10 + u16::from(last - b'0'),
-    };
+    let [numbers @ .., tens] = numbers;
+    let millisecond = u16::from(tens) * 10 + u16::from(last - b'0');
+    let fields = Fields::of_numbers(numbers, millisecond);
     let base = Base::Absolute;
     Some(Time { base, zone, fields })
 }
