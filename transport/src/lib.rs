@@ -28,6 +28,7 @@ mod parcel;
 mod peer_id;
 mod principal;
 mod quota_address;
+mod serde_text;
 pub mod threads;
 mod token_bucket;
 mod transport;

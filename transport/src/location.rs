@@ -8,6 +8,7 @@ use std::sync::Arc;
 use fipa_acl::is_unprintable;
 use serde::{Deserialize, Serialize};
 
+use crate::serde_text::serde_as_text;
 use crate::{Incarnation, quota_address, scoped_quota_address};
 
 /// A kind of transport, as named in the configuration and in addresses.
@@ -452,19 +453,7 @@ impl FromStr for Location {
     }
 }
 
-impl Serialize for Location {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
-    }
-}
-
-impl<'de> Deserialize<'de> for Location {
-    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        String::deserialize(deserializer)?
-            .parse()
-            .map_err(serde::de::Error::custom)
-    }
-}
+serde_as_text!(Location);
 
 #[cfg(test)]
 mod tests {

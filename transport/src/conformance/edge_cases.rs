@@ -87,25 +87,23 @@ pub fn an_attempt_that_is_abandoned_unsent_never_arrives(fixture: &dyn Fixture) 
     }
 }
 
+/// Posts letters from `a` to `b` with the numbers of these attempts. Returns the attempts that have begun.
+fn posted(a: &TestEndpoint, b: &TestEndpoint, attempts: impl IntoIterator<Item = u64>) -> Vec<u64> {
+    let begins = |attempt: &u64| {
+        let parcel = parcel(*attempt, letter("x"));
+        let begun = a.transport.post(AttemptId(*attempt), &b.location, parcel);
+        begun.is_ok()
+    };
+    attempts.into_iter().filter(begins).collect()
+}
+
 /// Every attempt to a receiver that closes is concluded.
 pub fn attempts_to_a_closing_receiver_are_concluded(fixture: &dyn Fixture) {
     let a = TestEndpoint::new(fixture);
     let b = TestEndpoint::new(fixture);
     a.send(0, &b, parcel(0, letter("x")));
     assert_eq!(concluded(&[&a, &b], &a, 0), accepted());
-    let mut open = Vec::new();
-    for attempt in 1..=4 {
-        if a.transport
-            .post(
-                AttemptId(attempt),
-                &b.location,
-                parcel(attempt, letter("x")),
-            )
-            .is_ok()
-        {
-            open.push(attempt);
-        }
-    }
+    let open = posted(&a, &b, 1..=4);
     b.transport.close();
     for attempt in open {
         let end = concluded(&[&a], &a, attempt);
@@ -122,19 +120,7 @@ pub fn attempts_to_a_closing_receiver_are_concluded(fixture: &dyn Fixture) {
 /// Every attempt of a sender that closes is concluded.
 pub fn attempts_of_a_closing_sender_are_concluded(fixture: &dyn Fixture) {
     let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
-    let mut open = Vec::new();
-    for attempt in 0..4 {
-        if a.transport
-            .post(
-                AttemptId(attempt),
-                &b.location,
-                parcel(attempt, letter("x")),
-            )
-            .is_ok()
-        {
-            open.push(attempt);
-        }
-    }
+    let open = posted(&a, &b, 0..4);
     a.transport.close();
     for attempt in open {
         concluded(&[&a, &b], &a, attempt);
