@@ -17,6 +17,7 @@ use std::sync::Arc;
 
 use crate::Moment;
 use crate::check::observed::ObservedMessage;
+use crate::check::open::Opening;
 use crate::check::outcome::Denied;
 use crate::conversation::ids::SlotIndex;
 use crate::conversation::names::Names;
@@ -24,7 +25,7 @@ use crate::conversation::party::{Party, Side, side_index};
 use crate::conversation::state::ELSEWHERE;
 use crate::monitor::Monitor;
 use crate::protocol::act::{Act, ActNumber, FAILURE, INFORM};
-use crate::protocol::index::{MachineIndex, StateId};
+use crate::protocol::index::StateId;
 use crate::protocol::machine::{Cancel, Machine, Scope, step};
 use crate::protocol::role::RoleSet;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
@@ -51,18 +52,16 @@ impl Monitor {
     /// Joins a conversation with a message to the monitored agent, if the message is an answer.
     pub(crate) fn join(
         &mut self,
-        id: &str,
-        parent: Option<SlotIndex>,
-        machine: MachineIndex,
+        opening: Opening<'_>,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<(), Denied> {
         let library = Arc::clone(&self.library);
-        let protocol = library.machine(machine);
+        let protocol = library.machine(opening.machine);
         let Some(protocol) = protocol.filter(|it| it.shows_initiator(observed.act)) else {
             return Ok(());
         };
-        let at = self.insert(id, parent, machine, observed, now)?;
+        let at = self.insert(opening, observed, now)?;
         let agent = self.agent.as_deref().unwrap_or_default();
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;

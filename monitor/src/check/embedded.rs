@@ -1,6 +1,7 @@
 //! Conversations within a conversation: the subprotocols of a state.
 
 use crate::check::observed::ObservedMessage;
+use crate::check::open::Opening;
 use crate::check::outcome::{Denied, Fault, Passed};
 use crate::conversation::Conversation;
 use crate::conversation::ids::SlotIndex;
@@ -50,8 +51,12 @@ impl Monitor {
                 (None, None) if self.began_elsewhere(library, main, name, observed.sender) => {
                     let inner = library.index_of(name).filter(|_| !observed.own);
                     if let Some(inner) = inner.filter(|_| children < self.limits.embedded) {
-                        let id = observed.conversation_id;
-                        let _ = self.join(id, Some(main), inner, observed, now);
+                        let opening = Opening {
+                            id: observed.conversation_id,
+                            parent: Some(main),
+                            machine: inner,
+                        };
+                        let _ = self.join(opening, observed, now);
                     }
                     Denied::Unchecked(Unchecked::BegunElsewhere)
                 }
@@ -67,8 +72,12 @@ impl Monitor {
         if children >= self.limits.embedded {
             return Err(Denied::Fault(Fault::plain(Kind::TooMany), main));
         }
-        let id = observed.conversation_id;
-        match self.open(id, Some(main), machine, observed, now) {
+        let opening = Opening {
+            id: observed.conversation_id,
+            parent: Some(main),
+            machine,
+        };
+        match self.open(opening, observed, now) {
             Ok(passed) => {
                 self.touch(main, now.millis());
                 Ok(passed)

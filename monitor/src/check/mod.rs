@@ -28,6 +28,7 @@ use crate::check::copies::take_copy;
 use crate::check::find::MAX_LOOKED_AT;
 use crate::check::judge::judge;
 use crate::check::observed::ObservedMessage;
+use crate::check::open::Opening;
 use crate::check::outcome::{Denied, Fault, Passed};
 use crate::check::report::violation;
 use crate::conversation::deadlines::Deadline;
@@ -164,7 +165,7 @@ impl Monitor {
             let Some(machine) = self.library.index_of(protocol) else {
                 return Err(self.unknown_protocol(protocol));
             };
-            return self.open(id, None, machine, &observed, now);
+            return self.open(Opening::alone(id, machine), &observed, now);
         };
         let machine = self.library.machine(slot.conversation.machine);
         let follows = |name| {

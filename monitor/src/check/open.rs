@@ -14,15 +14,38 @@ use crate::protocol::machine::{Machine, Scope, step};
 use crate::protocol::role::RoleSet;
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 
+/// A conversation that a message begins.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Opening<'a> {
+    pub(crate) id: &'a str,
+    /// The conversation within which it begins.
+    pub(crate) parent: Option<SlotIndex>,
+    pub(crate) machine: MachineIndex,
+}
+
+impl<'a> Opening<'a> {
+    /// Returns a conversation that begins within no other one.
+    pub(crate) fn alone(id: &'a str, machine: MachineIndex) -> Self {
+        Self {
+            id,
+            parent: None,
+            machine,
+        }
+    }
+}
+
 impl Monitor {
     pub(crate) fn open(
         &mut self,
-        id: &str,
-        parent: Option<SlotIndex>,
-        machine: MachineIndex,
+        opening: Opening<'_>,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<Passed, Denied> {
+        let Opening {
+            id,
+            parent,
+            machine,
+        } = opening;
         let library = Arc::clone(&self.library);
         let Some(protocol) = library.machine(machine) else {
             return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
@@ -31,7 +54,7 @@ impl Monitor {
         if parent.is_none()
             && let Some(projection) = protocol.projection.clone().filter(|_| self.agent.is_some())
         {
-            return self.open_local(id, machine, protocol, &projection, observed, now);
+            return self.open_local(opening, protocol, &projection, observed, now);
         }
         let begins = step(
             &protocol.initial().steps,
@@ -45,7 +68,7 @@ impl Monitor {
                 Some(_) => Denied::NotOpened(machine),
             });
         };
-        let at = self.insert(id, parent, machine, observed, now)?;
+        let at = self.insert(opening, observed, now)?;
         let may_continue = parent.is_none() && !self.is_certain(id);
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;
@@ -74,12 +97,11 @@ impl Monitor {
     /// Inserts a conversation that a message begins, and evicts others for it.
     pub(crate) fn insert(
         &mut self,
-        id: &str,
-        parent: Option<SlotIndex>,
-        machine: MachineIndex,
+        opening: Opening<'_>,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<SlotIndex, Denied> {
+        let Opening { id, parent, .. } = opening;
         if parent.is_none() {
             self.evict_alike(id)?;
         }
@@ -97,7 +119,9 @@ impl Monitor {
         let peer_cost = peer.map_or(0, |peer| Names::cost(self.names.text(peer).len()));
         // Its bytes are charged, and others evicted for them, when the message has been accepted.
         self.evict(parent, peer, 1);
-        let at = self.table.insert(id, parent, peer, machine, now.millis());
+        let at = self
+            .table
+            .insert(id, parent, peer, opening.machine, now.millis());
         if let Some(slot) = self.table.slot_mut(at) {
             slot.conversation.charge(peer_cost);
         }
@@ -128,7 +152,8 @@ impl Monitor {
         }
         // The sender may have named the monitored agent in a `reply-to`, or the agent has restarted.
         if protocol.shows_initiator(observed.act) {
-            if let Err(denied) = self.join(id, None, machine, observed, now) {
+            let opening = Opening::alone(id, machine);
+            if let Err(denied) = self.join(opening, observed, now) {
                 return denied;
             }
             return Denied::Unchecked(Unchecked::BegunElsewhere);

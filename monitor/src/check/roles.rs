@@ -6,6 +6,7 @@ use std::sync::Arc;
 use crate::Moment;
 use crate::check::judge::unbound;
 use crate::check::observed::{ObservedMessage, SentMessage};
+use crate::check::open::Opening;
 use crate::check::outcome::{Denied, Fault, Passed};
 use crate::conversation::Conversation;
 use crate::conversation::bindings::RoleBinding;
@@ -16,7 +17,7 @@ use crate::conversation::rare::LastSent;
 use crate::conversation::state::AFTER_NOT_UNDERSTOOD;
 use crate::monitor::Monitor;
 use crate::protocol::act::{ActNumber, CANCEL, FAILURE, NOT_UNDERSTOOD};
-use crate::protocol::index::{MachineIndex, StateId};
+use crate::protocol::index::StateId;
 use crate::protocol::machine::Machine;
 use crate::protocol::projection::{LocalRun, NotLocal, Observed, Projection};
 use crate::protocol::role::{Role, RoleSet};
@@ -26,24 +27,24 @@ impl Monitor {
     /// Begins a conversation with the first message that the agent sends or receives in it.
     pub(crate) fn open_local(
         &mut self,
-        id: &str,
-        index: MachineIndex,
+        opening: Opening<'_>,
         machine: &Machine,
         projection: &Projection,
         observed: &ObservedMessage<'_>,
         now: Moment,
     ) -> Result<Passed, Denied> {
+        let id = opening.id;
         if begun(projection, observed).is_none() {
             let certain = observed.own && self.is_certain(id);
             return Err(if certain || !machine.may_follow(observed.act) {
-                Denied::NotOpened(index)
+                Denied::NotOpened(opening.machine)
             } else {
                 self.remember_removed(id);
                 Denied::Unchecked(Unchecked::UnknownHistory)
             });
         }
         let is_certain = self.is_certain(id);
-        let at = self.insert(id, None, index, observed, now)?;
+        let at = self.insert(opening, observed, now)?;
         if let Some(slot) = self.table.slot_mut(at) {
             let conversation = &mut slot.conversation;
             conversation.initiator = Some(conversation.acquire(&mut self.names, observed.sender));
