@@ -9,7 +9,7 @@ use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::{DigitallySignedStruct, DistinguishedName, Error, RootCertStore, SignatureScheme};
 
-use super::verify::Known;
+use super::verify::{Known, tls13_signatures};
 
 /// The authorities whose certificates prove the host names of platforms (RFC 5280). Without any, only
 /// trusted certificates prove a platform.
@@ -64,6 +64,10 @@ impl Server {
     pub(super) fn new(known: Arc<Known>) -> Self {
         Self(known)
     }
+
+    fn algorithms(&self) -> WebPkiSupportedAlgorithms {
+        self.0.algorithms()
+    }
 }
 
 impl ServerCertVerifier for Server {
@@ -85,27 +89,7 @@ impl ServerCertVerifier for Server {
         known.verify_server_cert(presented, intermediates, name, ocsp, now)
     }
 
-    fn verify_tls12_signature(
-        &self,
-        message: &[u8],
-        certificate: &CertificateDer<'_>,
-        signed: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        ServerCertVerifier::verify_tls12_signature(&*self.0, message, certificate, signed)
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        message: &[u8],
-        certificate: &CertificateDer<'_>,
-        signed: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        ServerCertVerifier::verify_tls13_signature(&*self.0, message, certificate, signed)
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        ServerCertVerifier::supported_verify_schemes(&*self.0)
-    }
+    tls13_signatures!();
 }
 
 /// Lets a platform present any certificate or none. The handshake proves that the platform has the key of the
@@ -120,6 +104,10 @@ impl AnyClient {
         Self {
             algorithms: known.algorithms(),
         }
+    }
+
+    fn algorithms(&self) -> WebPkiSupportedAlgorithms {
+        self.algorithms
     }
 }
 
@@ -141,25 +129,5 @@ impl ClientCertVerifier for AnyClient {
         Ok(ClientCertVerified::assertion())
     }
 
-    fn verify_tls12_signature(
-        &self,
-        _message: &[u8],
-        _certificate: &CertificateDer<'_>,
-        _signed: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        super::verify::only_tls13()
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        message: &[u8],
-        certificate: &CertificateDer<'_>,
-        signed: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        rustls::crypto::verify_tls13_signature(message, certificate, signed, &self.algorithms)
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.algorithms.supported_schemes()
-    }
+    tls13_signatures!();
 }
