@@ -12,6 +12,8 @@ pub(crate) mod connections;
 pub(crate) mod cookie;
 pub(crate) mod dialing;
 pub(crate) mod endpoint;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 pub(crate) mod socket;
 
 use std::collections::HashSet;

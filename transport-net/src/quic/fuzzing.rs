@@ -23,14 +23,15 @@ use quinn::{ConnectionError, ReadError, VarInt};
 use tokio::runtime::{Builder, Runtime};
 
 use super::streams::{Letters, PeerStream, PeerStreams};
+use crate::NetLimits;
 use crate::stream::config::StreamConfig;
 use crate::stream::endpoint::Endpoint;
 use crate::stream::frame::{FrameReader, Space};
+use crate::stream::fuzzing::{Memory, identity};
 use crate::stream::link::{Link, LinkTask};
 use crate::stream::proof::Proof;
 use crate::stream::source::Source;
 use crate::stream::wire::{BoxFuture, ControlStream, Reading, StreamWriter, Writing};
-use crate::{Identity, NetLimits};
 
 const MAX_LETTER: usize = 100_000;
 const MAX_IN_FLIGHT: usize = 8;
@@ -234,18 +235,6 @@ struct Recorded {
     concluded: BTreeMap<AttemptId, Conclusion>,
 }
 
-struct Memory(Vec<u8>);
-
-impl LoanedContent for Memory {
-    fn content_mut(&mut self) -> &mut [u8] {
-        &mut self.0
-    }
-
-    fn freeze(self: Box<Self>) -> Bytes {
-        self.0.into()
-    }
-}
-
 impl Sink for Recorder {
     fn arrived(&self, arrival: Arrival) -> Reaction {
         let mut state = self.state.lock();
@@ -330,20 +319,8 @@ impl QuicStreams {
             max_incoming_per_source: MAX_INCOMING,
             ..NetLimits::default()
         };
-        let identity = Identity {
-            name: "fuzzed".into(),
-            incarnation: Incarnation::from_u64(OWN),
-            domain: "default".into(),
-            host: "here".into(),
-        };
-        let config = StreamConfig {
-            identity,
-            limits,
-            refused_dials: crate::refused_dials::RefusedDials::default(),
-            processes: false,
-            refusals: crate::refusals::Refusals::default(),
-            security: None,
-        };
+        let identity = identity(OWN);
+        let config = StreamConfig::new(identity, limits);
         let endpoint = Endpoint::new(Kind::Quic, config, RUNTIME.handle().clone());
         let sink = Arc::new(Recorder {
             state: Mutex::new(Recorded {

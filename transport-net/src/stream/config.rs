@@ -30,6 +30,21 @@ pub(crate) struct StreamConfig {
 }
 
 impl StreamConfig {
+    /// Returns a configuration without reports of refusals and without security.
+    pub(crate) fn new(identity: Identity, limits: NetLimits) -> Self {
+        Self {
+            identity,
+            limits,
+            refused_dials: RefusedDials::default(),
+            #[cfg(feature = "ip")]
+            processes: false,
+            #[cfg(feature = "ip")]
+            refusals: crate::refusals::Refusals::default(),
+            #[cfg(feature = "secure")]
+            security: None,
+        }
+    }
+
     /// Whether frames are exchanged with a peer at this address that has proved nothing.
     #[cfg(feature = "ip")]
     pub(crate) fn takes_frames_of(&self, ip: std::net::IpAddr) -> bool {
@@ -274,13 +289,8 @@ mod tests {
             (false, IpAddr::V4(elsewhere), "here", "test", false),
         ] {
             let config = StreamConfig {
-                identity: identity("here", "test"),
-                limits: NetLimits::default(),
-                refused_dials: RefusedDials::default(),
                 processes,
-                refusals: crate::refusals::Refusals::default(),
-                #[cfg(feature = "secure")]
-                security: None,
+                ..StreamConfig::new(identity("here", "test"), NetLimits::default())
             };
             let principal = config.principal_at(ip, &identity(host, domain));
             let expected = match is_local {

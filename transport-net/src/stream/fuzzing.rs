@@ -39,7 +39,8 @@ pub struct Framed {
     ended: bool,
 }
 
-struct Memory(Vec<u8>);
+/// Memory for large contents.
+pub(crate) struct Memory(pub(crate) Vec<u8>);
 
 impl LoanedContent for Memory {
     fn content_mut(&mut self) -> &mut [u8] {
@@ -51,14 +52,18 @@ impl LoanedContent for Memory {
     }
 }
 
+pub(crate) fn identity(incarnation: u64) -> Identity {
+    Identity {
+        name: "fuzzed".into(),
+        incarnation: Incarnation::from_u64(incarnation),
+        domain: "default".into(),
+        host: "here".into(),
+    }
+}
+
 fn hello(incarnation: u64) -> Hello {
     Hello {
-        identity: Identity {
-            name: "fuzzed".into(),
-            incarnation: Incarnation::from_u64(incarnation),
-            domain: "default".into(),
-            host: "here".into(),
-        },
+        identity: identity(incarnation),
         max_letter: MAX_LETTER as u64,
         max_in_flight: MAX_IN_FLIGHT as u32,
         serial: 1,

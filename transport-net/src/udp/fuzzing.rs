@@ -12,7 +12,7 @@ use super::config::UdpLimits;
 use super::core::{Core, CoreEvent};
 use super::packet::{self, Datagram, NO_COOKIE};
 use crate::Identity;
-use crate::datagrams::Path;
+use crate::datagrams::{Path, fuzzing};
 use crate::hello::{Hello, Load};
 
 /// Maximum number of datagrams sent in response to one.
@@ -77,15 +77,11 @@ pub enum Written<'a> {
 }
 
 fn address(peer: u8) -> SocketAddr {
-    SocketAddr::from(([192, 0, 2, 10 + peer % 4], 7788))
+    fuzzing::address(peer, 7788)
 }
 
 fn path(peer: u8) -> Path {
-    Path {
-        socket: 1,
-        remote: address(peer),
-        local: None,
-    }
+    fuzzing::path(address(peer))
 }
 
 fn hello(service: u64, serial: u64) -> Hello {
@@ -109,13 +105,6 @@ impl Datagrams {
     /// An endpoint whose random numbers follow from the seed.
     #[must_use]
     pub fn new(seed: u64, now: Instant) -> Self {
-        let mut random = seed;
-        let draw = move || {
-            // SplitMix64.
-            random = random.wrapping_add(0x9e37_79b9_7f4a_7c15);
-            let mixed = (random ^ (random >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            (mixed ^ (mixed >> 27)).max(1)
-        };
         let identity = hello(1, 0).identity;
         let limits = UdpLimits {
             max_connections: 8,
@@ -126,7 +115,7 @@ impl Datagrams {
         };
         let listening = vec!["192.0.2.1:7788".to_owned()];
         Self {
-            core: Core::new(identity, limits, listening, Box::new(draw), now),
+            core: Core::new(identity, limits, listening, fuzzing::random(seed), now),
             dispatched: 0,
             concluded: BTreeMap::new(),
             tickets: Vec::new(),

@@ -277,6 +277,24 @@ fn parcel(sequence: u64, len: usize) -> Parcel {
     }
 }
 
+/// The hello of a stranger.
+fn hello_of(incarnation: u64) -> crate::hello::Hello {
+    crate::hello::Hello {
+        identity: Identity {
+            name: "x".into(),
+            incarnation: Incarnation::from_u64(incarnation),
+            domain: "test".into(),
+            host: "x".into(),
+        },
+        max_letter: 1000,
+        max_in_flight: 10,
+        serial: 1,
+        dialed: "x".into(),
+        listening: Vec::new(),
+        load: crate::hello::Load::Any,
+    }
+}
+
 fn seeds() -> std::ops::Range<u64> {
     match std::env::var("FIPA_SIM_SEEDS") {
         Ok(count) => 0..count.parse().unwrap(),
@@ -456,20 +474,7 @@ fn idle_connections_are_removed_on_both_sides() {
 #[test]
 fn unproved_peers_leave_no_state_and_get_fewer_bytes_than_they_sent() {
     let mut simulation = Simulation::new(1, FAIR, &UdpLimits::default());
-    let hello = crate::hello::Hello {
-        identity: Identity {
-            name: "x".into(),
-            incarnation: Incarnation::from_u64(9),
-            domain: "test".into(),
-            host: "x".into(),
-        },
-        max_letter: 1000,
-        max_in_flight: 10,
-        serial: 1,
-        dialed: "x".into(),
-        listening: Vec::new(),
-        load: crate::hello::Load::Any,
-    };
+    let hello = hello_of(9);
     let spoofed = |n: u32| SocketAddr::from((n.to_be_bytes(), 99));
     let mut concluded = 0;
     for n in 1..2000_u32 {
@@ -544,20 +549,7 @@ fn connections_of_one_address_are_bounded() {
     };
     let mut simulation = Simulation::new(1, FAIR, &limits);
     for n in 0..30_u64 {
-        let hello = crate::hello::Hello {
-            identity: Identity {
-                name: "x".into(),
-                incarnation: Incarnation::from_u64(n + 1),
-                domain: "test".into(),
-                host: "x".into(),
-            },
-            max_letter: 1000,
-            max_in_flight: 10,
-            serial: 1,
-            dialed: "x".into(),
-            listening: Vec::new(),
-            load: crate::hello::Load::Any,
-        };
+        let hello = hello_of(n + 1);
         let from = match n {
             0..10 => "198.51.100.7".to_owned(),
             // A host of IPv6 can use any number of addresses.

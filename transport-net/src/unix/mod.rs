@@ -91,17 +91,7 @@ impl UnixTransport {
             identity,
             limits,
         } = config;
-        let config = StreamConfig {
-            identity,
-            limits,
-            refused_dials: crate::refused_dials::RefusedDials::default(),
-            #[cfg(feature = "ip")]
-            processes: false,
-            #[cfg(feature = "ip")]
-            refusals: crate::Refusals::default(),
-            #[cfg(feature = "secure")]
-            security: None,
-        };
+        let config = StreamConfig::new(identity, limits);
         Self {
             path: directory,
             endpoint: Endpoint::new(Kind::Unix, config, runtime),

@@ -171,13 +171,9 @@ impl HttpTransport {
             security,
         } = config;
         let config = StreamConfig {
-            identity,
-            limits,
-            refused_dials: crate::refused_dials::RefusedDials::default(),
-            processes: false,
-            refusals: crate::refusals::Refusals::default(),
             #[cfg(feature = "secure")]
             security,
+            ..StreamConfig::new(identity, limits)
         };
         let endpoint = Arc::new(HttpEndpoint {
             stream: Endpoint::new(kind, config, runtime),

@@ -16,7 +16,7 @@ use super::packet::{
     Position, REQUEST, VERSION,
 };
 use super::sequence;
-use crate::datagrams::Path;
+use crate::datagrams::{Path, fuzzing};
 
 /// Maximum number of packets sent in response to one.
 const MOST: usize = 100_000;
@@ -98,28 +98,17 @@ pub enum UdtPacket<'a> {
 }
 
 fn address(peer: u8) -> SocketAddr {
-    SocketAddr::from(([192, 0, 2, 10 + peer % 4], 7790))
+    fuzzing::address(peer, 7790)
 }
 
 fn path(peer: u8) -> Path {
-    Path {
-        socket: 1,
-        remote: address(peer),
-        local: None,
-    }
+    fuzzing::path(address(peer))
 }
 
 impl UdtPackets {
     /// An endpoint whose random numbers follow from the seed.
     #[must_use]
     pub fn new(seed: u64, now: Instant) -> Self {
-        let mut random = seed;
-        let draw = move || {
-            // SplitMix64.
-            random = random.wrapping_add(0x9e37_79b9_7f4a_7c15);
-            let mixed = (random ^ (random >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            (mixed ^ (mixed >> 27)).max(1)
-        };
         let limits = UdtLimits {
             max_letter: 200_000,
             max_connections: 8,
@@ -130,7 +119,7 @@ impl UdtPackets {
             ..UdtLimits::default()
         };
         Self {
-            core: Core::new(limits, Box::new(|_| true), Box::new(draw), now),
+            core: Core::new(limits, Box::new(|_| true), fuzzing::random(seed), now),
             now,
             dispatched: 0,
             concluded: BTreeMap::new(),

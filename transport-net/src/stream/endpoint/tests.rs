@@ -36,15 +36,7 @@ fn identity(incarnation: u64) -> Identity {
 
 /// An endpoint without a listener. Must be used within a runtime.
 fn endpoint(limits: NetLimits) -> Arc<Endpoint> {
-    let config = StreamConfig {
-        identity: identity(1 << 40),
-        limits,
-        refused_dials: crate::refused_dials::RefusedDials::default(),
-        processes: false,
-        refusals: crate::refusals::Refusals::default(),
-        #[cfg(feature = "secure")]
-        security: None,
-    };
+    let config = StreamConfig::new(identity(1 << 40), limits);
     let endpoint = Endpoint::new(Kind::Tcp, config, Handle::current());
     let mut registry = endpoint.registry.lock();
     registry.phase = Phase::Open;
