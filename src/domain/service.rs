@@ -123,14 +123,14 @@ impl Service {
         let watchers = Arc::new(Watchers::new(&own, role.gateway));
         let mut refused = Vec::new();
         let mut maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host));
-        let transports = transports(
+        let mut parts = TransportParts {
             config,
-            &role,
-            &mut maintenance,
+            role: &role,
+            maintenance: &mut maintenance,
             incarnation,
-            &handle,
-            &mut refused,
-        );
+            handle: &handle,
+        };
+        let transports = parts.transports(&mut refused);
         let Started { mts, failed, .. } = Mts::start(
             core_config(config, &role, incarnation),
             RuntimeConfig {
@@ -386,250 +386,210 @@ fn used<'a>(config: &'a Config, role: &Role<'_>) -> impl Iterator<Item = Kind> +
     })
 }
 
-/// Creates the transports for this role that are built in. Adds the reason of each failure to
-/// `refused`.
-fn transports(
-    config: &Config,
-    role: &Role<'_>,
-    maintenance: &mut DirMaintenance,
+/// What the transports of a service are made of.
+struct TransportParts<'a> {
+    config: &'a Config,
+    role: &'a Role<'a>,
+    maintenance: &'a mut DirMaintenance,
     incarnation: Incarnation,
-    handle: &Handle,
-    refused: &mut Vec<(Kind, String)>,
-) -> Vec<Arc<dyn Transport>> {
-    let mut transports: Vec<Arc<dyn Transport>> = Vec::new();
-    for kind in used(config, role) {
-        let opened = match kind {
-            #[cfg(feature = "shm")]
-            Kind::Shm => shm(config, role, maintenance, incarnation, handle),
-            Kind::Unix => unix(config, role, maintenance, incarnation, handle),
-            #[cfg(feature = "net")]
-            Kind::Tcp => tcp(config, role, &maintenance.dir, incarnation, handle),
-            #[cfg(feature = "net")]
-            Kind::Udp => udp(config, role, &maintenance.dir, incarnation, handle),
-            #[cfg(feature = "quic")]
-            Kind::Quic => match &role.security {
-                Some(security) => quic(
-                    config,
-                    role,
-                    security,
-                    &maintenance.dir,
-                    incarnation,
-                    handle,
-                ),
-                // Cannot happen: the check of the configuration demands keys for QUIC.
-                None => continue,
-            },
-            #[cfg(feature = "http")]
-            Kind::Http => http(config, role, &maintenance.dir, incarnation, handle),
-            #[cfg(all(feature = "http", feature = "secure"))]
-            Kind::Https => https(config, role, &maintenance.dir, incarnation, handle),
-            #[cfg(feature = "udt")]
-            Kind::Udt => udt(config, role, &maintenance.dir, incarnation, handle),
-            // One configuration serves all processes of a robot; their features may differ.
-            other => {
-                tracing::debug!(kind = %other, "this program was built without a transport");
-                continue;
+    handle: &'a Handle,
+}
+
+impl TransportParts<'_> {
+    /// Creates the transports for this role that are built in. Adds the reason of each failure to
+    /// `refused`.
+    fn transports(&mut self, refused: &mut Vec<(Kind, String)>) -> Vec<Arc<dyn Transport>> {
+        let mut transports: Vec<Arc<dyn Transport>> = Vec::new();
+        for kind in used(self.config, self.role) {
+            let opened = match kind {
+                #[cfg(feature = "shm")]
+                Kind::Shm => self.shm(),
+                Kind::Unix => self.unix(),
+                #[cfg(feature = "net")]
+                Kind::Tcp => self.tcp(),
+                #[cfg(feature = "net")]
+                Kind::Udp => self.udp(),
+                #[cfg(feature = "quic")]
+                Kind::Quic => match &self.role.security {
+                    Some(security) => self.quic(security),
+                    // Cannot happen: the check of the configuration demands keys for QUIC.
+                    None => continue,
+                },
+                #[cfg(feature = "http")]
+                Kind::Http => self.http(),
+                #[cfg(all(feature = "http", feature = "secure"))]
+                Kind::Https => self.https(),
+                #[cfg(feature = "udt")]
+                Kind::Udt => self.udt(),
+                // One configuration serves all processes of a robot; their features may differ.
+                other => {
+                    tracing::debug!(kind = %other, "this program was built without a transport");
+                    continue;
+                }
+            };
+            match opened {
+                Ok(transport) => transports.push(transport),
+                Err(error) => refused.push((kind, error)),
             }
+        }
+        transports
+    }
+
+    #[cfg(feature = "shm")]
+    fn shm(&mut self) -> Result<Arc<dyn Transport>, String> {
+        use fipa_transport_shm::{ShmConfig, ShmTransport};
+        let settings = &self.config.transport.shm;
+        let config = ShmConfig {
+            capacity: settings.capacity,
+            max_letter: usize::try_from(settings.max_letter).unwrap_or(usize::MAX),
+            answers_late: self.role.gateway,
+            ..ShmConfig::new(
+                self.maintenance.dir.part("shm"),
+                self.maintenance.dir.prefix(),
+                self.incarnation,
+            )
         };
-        match opened {
-            Ok(transport) => transports.push(transport),
-            Err(error) => refused.push((kind, error)),
-        }
+        let transport = ShmTransport::new(config, self.handle.clone());
+        let transport = transport.map_err(|error| ErrorChain(&error).to_string())?;
+        let transport = Arc::new(transport);
+        self.maintenance.shm = Some(Arc::downgrade(&transport));
+        self.tidy(&transport, ShmTransport::tidy);
+        Ok(transport)
     }
-    transports
-}
 
-#[cfg(feature = "shm")]
-fn shm(
-    config: &Config,
-    role: &Role<'_>,
-    maintenance: &mut DirMaintenance,
-    incarnation: Incarnation,
-    handle: &Handle,
-) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_shm::{ShmConfig, ShmTransport};
-    let settings = &config.transport.shm;
-    let config = ShmConfig {
-        capacity: settings.capacity,
-        max_letter: usize::try_from(settings.max_letter).unwrap_or(usize::MAX),
-        answers_late: role.gateway,
-        ..ShmConfig::new(
-            maintenance.dir.part("shm"),
-            maintenance.dir.prefix(),
-            incarnation,
-        )
-    };
-    let transport = ShmTransport::new(config, handle.clone());
-    let transport = transport.map_err(|error| ErrorChain(&error).to_string())?;
-    let transport = Arc::new(transport);
-    maintenance.shm = Some(Arc::downgrade(&transport));
-    tidy(handle, maintenance, &transport, ShmTransport::tidy);
-    Ok(transport)
-}
+    fn unix(&mut self) -> Result<Arc<dyn Transport>, String> {
+        use fipa_transport_net::{UnixConfig, UnixTransport};
+        let config = UnixConfig {
+            directory: self.maintenance.dir.part("unix"),
+            identity: self.identity()?,
+            limits: stream_limits(self.config),
+        };
+        let transport = Arc::new(UnixTransport::new(config, self.handle.clone()));
+        self.maintenance.unix = Some(Arc::downgrade(&transport));
+        self.tidy(&transport, UnixTransport::tidy);
+        Ok(transport)
+    }
 
-fn unix(
-    config: &Config,
-    role: &Role<'_>,
-    maintenance: &mut DirMaintenance,
-    incarnation: Incarnation,
-    handle: &Handle,
-) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{UnixConfig, UnixTransport};
-    let config = UnixConfig {
-        directory: maintenance.dir.part("unix"),
-        identity: identity(config, role, &maintenance.dir, incarnation)?,
-        limits: stream_limits(config),
-    };
-    let transport = Arc::new(UnixTransport::new(config, handle.clone()));
-    maintenance.unix = Some(Arc::downgrade(&transport));
-    tidy(handle, maintenance, &transport, UnixTransport::tidy);
-    Ok(transport)
-}
-
-/// Starts a task that removes a transport's leftovers of processes that have ended. The directory
-/// detects the end of every process, a transport only of those that it has connections with.
-fn tidy<T: Transport>(
-    handle: &Handle,
-    maintenance: &DirMaintenance,
-    transport: &Arc<T>,
-    tidy: impl Fn(&T) + Send + 'static,
-) {
-    let (mut departures, weak) = (maintenance.host.departures(), Arc::downgrade(transport));
-    handle.spawn(async move {
-        while departures.next().await {
-            match weak.upgrade() {
-                Some(transport) => tidy(&transport),
-                None => return,
+    /// Starts a task that removes a transport's leftovers of processes that have ended. The directory
+    /// detects the end of every process, a transport only of those that it has connections with.
+    fn tidy<T: Transport>(&self, transport: &Arc<T>, tidy: impl Fn(&T) + Send + 'static) {
+        let mut departures = self.maintenance.host.departures();
+        let weak = Arc::downgrade(transport);
+        self.handle.spawn(async move {
+            while departures.next().await {
+                match weak.upgrade() {
+                    Some(transport) => tidy(&transport),
+                    None => return,
+                }
             }
-        }
-    });
-}
-
-#[cfg(feature = "net")]
-fn tcp(
-    config: &Config,
-    role: &Role<'_>,
-    dir: &DomainDir,
-    incarnation: Incarnation,
-    handle: &Handle,
-) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{TcpConfig, TcpTransport};
-    let mut tcp = TcpConfig::new(
-        listen(&config.transport.tcp.listen, role),
-        identity(config, role, dir, incarnation)?,
-    );
-    tcp.limits = stream_limits(config);
-    tcp.processes = config.transport.tcp.processes;
-    tcp.refusals = role.refusals.clone();
-    tcp.refused_dials = role.refused_dials.clone();
-    #[cfg(feature = "secure")]
-    {
-        tcp.security = role.security.clone();
+        });
     }
-    Ok(Arc::new(TcpTransport::new(tcp, handle.clone())))
-}
 
-#[cfg(feature = "net")]
-fn udp(
-    config: &Config,
-    role: &Role<'_>,
-    dir: &DomainDir,
-    incarnation: Incarnation,
-    handle: &Handle,
-) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{UdpConfig, UdpTransport};
-    let config = UdpConfig {
-        listen: config.transport.udp.listen.clone(),
-        identity: identity(config, role, dir, incarnation)?,
-        limits: datagram_limits(config),
-    };
-    Ok(Arc::new(UdpTransport::new(config, handle.clone())))
-}
-
-#[cfg(feature = "quic")]
-fn quic(
-    config: &Config,
-    role: &Role<'_>,
-    security: &fipa_transport_net::secure::Security,
-    dir: &DomainDir,
-    incarnation: Incarnation,
-    handle: &Handle,
-) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{QuicConfig, QuicTransport};
-    let config = QuicConfig {
-        listen: config.transport.quic.listen.clone(),
-        identity: identity(config, role, dir, incarnation)?,
-        limits: stream_limits(config),
-        refused_dials: role.refused_dials.clone(),
-        security: security.clone(),
-        refusals: role.refusals.clone(),
-    };
-    Ok(Arc::new(QuicTransport::new(config, handle.clone())))
-}
-
-#[cfg(feature = "http")]
-fn http(
-    config: &Config,
-    role: &Role<'_>,
-    dir: &DomainDir,
-    incarnation: Incarnation,
-    handle: &Handle,
-) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{HttpConfig, HttpTransport};
-    let config = HttpConfig {
-        listen: config.transport.http.listen.clone(),
-        identity: identity(config, role, dir, incarnation)?,
-        limits: stream_limits(config),
+    #[cfg(feature = "net")]
+    fn tcp(&self) -> Result<Arc<dyn Transport>, String> {
+        use fipa_transport_net::{TcpConfig, TcpTransport};
+        let mut tcp = TcpConfig::new(
+            listen(&self.config.transport.tcp.listen, self.role),
+            self.identity()?,
+        );
+        tcp.limits = stream_limits(self.config);
+        tcp.processes = self.config.transport.tcp.processes;
+        tcp.refusals = self.role.refusals.clone();
+        tcp.refused_dials = self.role.refused_dials.clone();
         #[cfg(feature = "secure")]
-        security: role.security.clone(),
-    };
-    Ok(Arc::new(HttpTransport::new(config, handle.clone())))
-}
+        {
+            tcp.security = self.role.security.clone();
+        }
+        Ok(Arc::new(TcpTransport::new(tcp, self.handle.clone())))
+    }
 
-#[cfg(all(feature = "http", feature = "secure"))]
-fn https(
-    config: &Config,
-    role: &Role<'_>,
-    dir: &DomainDir,
-    incarnation: Incarnation,
-    handle: &Handle,
-) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{HttpConfig, HttpTransport};
-    let Some(security) = &role.security else {
-        return Err("https needs keys (security.keys)".to_owned());
-    };
-    let settings = &config.transport.https;
-    let authorities = crate::admin::keys::authorities(settings.authorities.as_ref());
-    let authorities = authorities.map_err(|error| ErrorChain(&error).to_string())?;
-    let set = security.set_authorities(authorities);
-    set.map_err(|error| ErrorChain(&error).to_string())?;
-    let config = HttpConfig {
-        listen: settings.listen.clone(),
-        identity: identity(config, role, dir, incarnation)?,
-        limits: stream_limits(config),
-        security: Some(security.clone()),
-    };
-    let transport = HttpTransport::over_tls(config, security.clone(), handle.clone());
-    Ok(Arc::new(transport))
-}
+    #[cfg(feature = "net")]
+    fn udp(&self) -> Result<Arc<dyn Transport>, String> {
+        use fipa_transport_net::{UdpConfig, UdpTransport};
+        let config = UdpConfig {
+            listen: self.config.transport.udp.listen.clone(),
+            identity: self.identity()?,
+            limits: datagram_limits(self.config),
+        };
+        Ok(Arc::new(UdpTransport::new(config, self.handle.clone())))
+    }
 
-#[cfg(feature = "udt")]
-fn udt(
-    config: &Config,
-    role: &Role<'_>,
-    dir: &DomainDir,
-    incarnation: Incarnation,
-    handle: &Handle,
-) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{UdtConfig, UdtTransport};
-    let config = UdtConfig {
-        listen: config.transport.udt.listen.clone(),
-        identity: identity(config, role, dir, incarnation)?,
-        limits: udt_limits(config),
-        #[cfg(feature = "secure")]
-        security: role.security.clone(),
-    };
-    Ok(Arc::new(UdtTransport::new(config, handle.clone())))
+    #[cfg(feature = "quic")]
+    fn quic(
+        &self,
+        security: &fipa_transport_net::secure::Security,
+    ) -> Result<Arc<dyn Transport>, String> {
+        use fipa_transport_net::{QuicConfig, QuicTransport};
+        let config = QuicConfig {
+            listen: self.config.transport.quic.listen.clone(),
+            identity: self.identity()?,
+            limits: stream_limits(self.config),
+            refused_dials: self.role.refused_dials.clone(),
+            security: security.clone(),
+            refusals: self.role.refusals.clone(),
+        };
+        Ok(Arc::new(QuicTransport::new(config, self.handle.clone())))
+    }
+
+    #[cfg(feature = "http")]
+    fn http(&self) -> Result<Arc<dyn Transport>, String> {
+        use fipa_transport_net::{HttpConfig, HttpTransport};
+        let config = HttpConfig {
+            listen: self.config.transport.http.listen.clone(),
+            identity: self.identity()?,
+            limits: stream_limits(self.config),
+            #[cfg(feature = "secure")]
+            security: self.role.security.clone(),
+        };
+        Ok(Arc::new(HttpTransport::new(config, self.handle.clone())))
+    }
+
+    #[cfg(all(feature = "http", feature = "secure"))]
+    fn https(&self) -> Result<Arc<dyn Transport>, String> {
+        use fipa_transport_net::{HttpConfig, HttpTransport};
+        let Some(security) = &self.role.security else {
+            return Err("https needs keys (security.keys)".to_owned());
+        };
+        let settings = &self.config.transport.https;
+        let authorities = crate::admin::keys::authorities(settings.authorities.as_ref());
+        let authorities = authorities.map_err(|error| ErrorChain(&error).to_string())?;
+        let set = security.set_authorities(authorities);
+        set.map_err(|error| ErrorChain(&error).to_string())?;
+        let config = HttpConfig {
+            listen: settings.listen.clone(),
+            identity: self.identity()?,
+            limits: stream_limits(self.config),
+            security: Some(security.clone()),
+        };
+        let transport = HttpTransport::over_tls(config, security.clone(), self.handle.clone());
+        Ok(Arc::new(transport))
+    }
+
+    #[cfg(feature = "udt")]
+    fn udt(&self) -> Result<Arc<dyn Transport>, String> {
+        use fipa_transport_net::{UdtConfig, UdtTransport};
+        let config = UdtConfig {
+            listen: self.config.transport.udt.listen.clone(),
+            identity: self.identity()?,
+            limits: udt_limits(self.config),
+            #[cfg(feature = "secure")]
+            security: self.role.security.clone(),
+        };
+        Ok(Arc::new(UdtTransport::new(config, self.handle.clone())))
+    }
+
+    fn identity(&self) -> Result<fipa_transport_net::Identity, String> {
+        Ok(fipa_transport_net::Identity {
+            name: self.role.name.to_string(),
+            incarnation: self.incarnation,
+            domain: self.config.domain.clone(),
+            host: self
+                .maintenance
+                .dir
+                .host_id()
+                .map_err(|error| format!("cannot identify this host: {}", ErrorChain(&error)))?,
+        })
+    }
 }
 
 /// Returns the limits of UDT, whose largest letter is that of its peers.
@@ -675,22 +635,6 @@ fn listen(addresses: &[String], role: &Role<'_>) -> Vec<String> {
     } else {
         vec!["127.0.0.1:0".to_owned()]
     }
-}
-
-fn identity(
-    config: &Config,
-    role: &Role<'_>,
-    dir: &DomainDir,
-    incarnation: Incarnation,
-) -> Result<fipa_transport_net::Identity, String> {
-    Ok(fipa_transport_net::Identity {
-        name: role.name.to_string(),
-        incarnation,
-        domain: config.domain.clone(),
-        host: dir
-            .host_id()
-            .map_err(|error| format!("cannot identify this host: {}", ErrorChain(&error)))?,
-    })
 }
 
 #[cfg(all(test, feature = "net"))]
