@@ -150,13 +150,7 @@ impl Side {
                         accepted.conversation.cancel();
                     }
                     // A mistake of the client does not end its goal.
-                    Err(
-                        DialogueError::Unexpected(_)
-                        | DialogueError::Violation { .. }
-                        | DialogueError::Unchecked(_)
-                        | DialogueError::NotUnderstood(_)
-                        | DialogueError::Undelivered(_),
-                    ) => {}
+                    Err(error) if is_mistake(&error) => {}
                     Err(_) => return Reply::Nothing,
                 },
             }
@@ -278,18 +272,24 @@ impl Side {
     }
 }
 
+/// Whether an error while a client is awaited is a mistake of the client, which does not end the conversation.
+fn is_mistake(error: &DialogueError) -> bool {
+    matches!(
+        error,
+        DialogueError::Unexpected(_)
+            | DialogueError::Violation { .. }
+            | DialogueError::Unchecked(_)
+            | DialogueError::NotUnderstood(_)
+            | DialogueError::Undelivered(_)
+    )
+}
+
 /// Waits until the subscriber cancels or is gone.
 async fn ended(task: &mut Task) -> Reply {
     loop {
         match task.cancelled().await {
             Ok(()) => return task.confirm_cancel().await.unwrap_or(Reply::Nothing),
-            Err(
-                DialogueError::Unexpected(_)
-                | DialogueError::Violation { .. }
-                | DialogueError::Unchecked(_)
-                | DialogueError::NotUnderstood(_)
-                | DialogueError::Undelivered(_),
-            ) => {}
+            Err(error) if is_mistake(&error) => {}
             Err(_) => return Reply::Nothing,
         }
     }
