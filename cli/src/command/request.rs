@@ -79,6 +79,29 @@ pub(super) struct Opening {
 }
 
 impl Opening {
+    /// Runs a conversation of the asking agent, and leaves the domain after it.
+    pub(super) fn run(
+        &self,
+        command: &str,
+        global: &Global,
+        conversation: impl AsyncFnOnce(&Agent, &mut Stop) -> Result<(), Failure>,
+    ) -> Result<(), Failure> {
+        let config = global.config()?;
+        options::block_on(async {
+            let mut stop = Stop::listen()?;
+            let domain = membership::join(&config).await?;
+            let agent = self.register(&domain, command, &config).await;
+            let done = match &agent {
+                Ok(agent) => conversation(agent, &mut stop).await,
+                Err(_) => Ok(()),
+            };
+            Stop::ending();
+            let registered = agent.map(drop);
+            domain.close().await;
+            registered.and(done)
+        })?
+    }
+
     /// Registers the asking agent.
     pub(super) async fn register(
         &self,
@@ -121,23 +144,11 @@ impl Opening {
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
-    let config = global.config()?;
-    options::block_on(async {
-        let mut stop = Stop::listen()?;
-        let domain = membership::join(&config).await?;
-        let agent = arguments
-            .opening
-            .register(&domain, "request", &config)
-            .await;
-        let done = match &agent {
-            Ok(agent) => converse(agent, &arguments, &mut stop).await,
-            Err(_) => Ok(()),
-        };
-        Stop::ending();
-        let registered = agent.map(drop);
-        domain.close().await;
-        registered.and(done)
-    })?
+    arguments
+        .opening
+        .run("request", global, async |agent, stop| {
+            converse(agent, &arguments, stop).await
+        })
 }
 
 async fn converse(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result<(), Failure> {

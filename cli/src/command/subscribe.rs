@@ -10,7 +10,7 @@ use serde_json::json;
 
 use super::request::{CANCEL_WITHIN, Opening, failed, line, unless_stopped};
 use crate::complete;
-use crate::membership::{self, Stop};
+use crate::membership::Stop;
 use crate::options::{self, Global};
 use crate::output::{self, Reader};
 use crate::report::{self, Failure};
@@ -76,23 +76,11 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
-    let config = global.config()?;
-    options::block_on(async {
-        let mut stop = Stop::listen()?;
-        let domain = membership::join(&config).await?;
-        let agent = arguments
-            .opening
-            .register(&domain, "subscribe", &config)
-            .await;
-        let done = match &agent {
-            Ok(agent) => follow(agent, &arguments, &mut stop).await,
-            Err(_) => Ok(()),
-        };
-        Stop::ending();
-        let registered = agent.map(drop);
-        domain.close().await;
-        registered.and(done)
-    })?
+    arguments
+        .opening
+        .run("subscribe", global, async |agent, stop| {
+            follow(agent, &arguments, stop).await
+        })
 }
 
 async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result<(), Failure> {
