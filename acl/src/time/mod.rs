@@ -184,29 +184,21 @@ impl Time {
 
     /// Creates a time after checking the ranges of its fields.
     pub(crate) fn new(base: Base, zone: Zone, fields: Fields) -> Result<Self, TimeError> {
-        let Fields {
-            year,
-            month,
-            day,
-            hour,
-            minute,
-            second,
-            millisecond,
-        } = fields;
         let fits = match base {
             // A leap second is 60. System times do not count leap seconds.
             Base::Absolute => {
-                (1..=12).contains(&month)
-                    && (1..=days_of_month(year, month)).contains(&day)
-                    && hour < 24
-                    && minute < 60
-                    && second <= 60
+                (1..=12).contains(&fields.month)
+                    && (1..=days_of_month(fields.year, fields.month)).contains(&fields.day)
+                    && fields.hour < 24
+                    && fields.minute < 60
+                    && fields.second <= 60
             }
             Base::After | Base::Before => {
-                month < 100 && day < 100 && hour < 100 && minute < 100 && second < 100
+                let date = fields.month < 100 && fields.day < 100;
+                date && fields.hour < 100 && fields.minute < 100 && fields.second < 100
             }
         };
-        if !fits || year > 9999 || millisecond > 999 {
+        if !fits || fields.year > 9999 || fields.millisecond > 999 {
             return Err(TimeError::Range(fields.date_and_time(' ')));
         }
         Ok(Self { base, zone, fields })

@@ -39,18 +39,11 @@ impl fmt::Display for Time {
             Base::After => "+",
             Base::Before => "-",
         };
-        let Fields {
-            year,
-            month,
-            day,
-            hour,
-            minute,
-            second,
-            millisecond,
-        } = self.fields;
+        let at = self.fields;
         write!(
             f,
-            "{sign}{year:04}{month:02}{day:02}T{hour:02}{minute:02}{second:02}{millisecond:03}"
+            "{sign}{:04}{:02}{:02}T{:02}{:02}{:02}{:03}",
+            at.year, at.month, at.day, at.hour, at.minute, at.second, at.millisecond
         )?;
         match self.zone {
             Zone::Unspecified => Ok(()),
