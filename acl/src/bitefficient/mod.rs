@@ -17,7 +17,8 @@ pub(crate) mod reader;
 mod view;
 pub(crate) mod write;
 
-pub(crate) use agent_id::without_x;
+pub(crate) use agent_id::{InMessages, without_x};
 pub use code_table::CodeTable;
+pub(crate) use identifier::{next as next_agent_id, next_part as next_agent_id_part};
 pub(crate) use view::{next_user_defined, view, view_noting, view_split};
 pub use write::{encode, encoded_len};

@@ -9,6 +9,7 @@ mod write;
 
 use std::collections::HashSet;
 
+pub(crate) use agent_id::InEnvelopes;
 pub use view::{EnvelopeView, ReceiverNames, StampView, Stamps};
 pub use write::EnvelopeTemplate;
 pub(crate) use write::encode;

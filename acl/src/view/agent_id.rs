@@ -1,10 +1,7 @@
 //! Agent identifiers, borrowed from the bytes they were read from.
 
-use crate::bitefficient::agent_id::InMessages;
-use crate::bitefficient::identifier;
-use crate::envelope::agent_id::InEnvelopes;
 use crate::error::{DecodeError, Problem};
-use crate::{AgentId, AgentIdError, Text, string, xml};
+use crate::{AgentId, AgentIdError, Text, bitefficient, envelope, string, xml};
 
 /// An agent identifier in an encoded message or envelope.
 #[derive(Debug, Clone, Copy)]
@@ -152,8 +149,10 @@ impl<'a> Iterator for AgentIds<'a> {
         // An error cannot occur in checked bytes. It would end the iteration.
         match &mut self.0 {
             Set::Empty => None,
-            Set::BitEfficient(rest) => identifier::next::<InMessages>(rest),
-            Set::Envelope(rest) => identifier::next::<InEnvelopes>(rest),
+            Set::BitEfficient(rest) => {
+                bitefficient::next_agent_id::<bitefficient::InMessages>(rest)
+            }
+            Set::Envelope(rest) => bitefficient::next_agent_id::<envelope::InEnvelopes>(rest),
             Set::String(rest) => string::agent_id::next(rest),
             Set::Xml(set) => set.next(),
         }
@@ -201,8 +200,8 @@ impl<'a> Iterator for Parts<'a> {
 
     fn next(&mut self) -> Option<Part<'a>> {
         let next = match self.encoding {
-            Encoding::BitEfficient => identifier::next_part::<InMessages>,
-            Encoding::Envelope => identifier::next_part::<InEnvelopes>,
+            Encoding::BitEfficient => bitefficient::next_agent_id_part::<bitefficient::InMessages>,
+            Encoding::Envelope => bitefficient::next_agent_id_part::<envelope::InEnvelopes>,
             Encoding::String => string::agent_id::next_part,
             Encoding::Xml => xml::next_part,
         };
