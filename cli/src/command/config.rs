@@ -15,20 +15,14 @@ use crate::report::Failure;
 /// The configuration is one TOML file: the file given with --config, else the file named by
 /// $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml. No other file is read. Keys that
 /// the file does not set have their defaults. $FIPA_DOMAIN overrides the domain of the file. --set KEY=VALUE overrides single keys.
-#[derive(Debug, Args)]
+#[derive(Debug, Subcommand)]
 #[command(after_help = "\
 Examples:
   fipa config show                          prints each value with its origin
   fipa config show > new.toml               writes a file with all keys
   fipa --set mts.deadline=9s config show    shows the effect of an override
   fipa config check --config robot.toml     checks a file for errors")]
-pub(crate) struct Arguments {
-    #[command(subcommand)]
-    action: Action,
-}
-
-#[derive(Debug, Subcommand)]
-enum Action {
+pub(crate) enum Arguments {
     /// Print the effective configuration with the origin of every value
     ///
     /// The output is a valid configuration file with every key. A comment after each value names its
@@ -70,17 +64,17 @@ JSON:
 }
 
 #[derive(Debug, Args)]
-struct Json {
+pub(crate) struct Json {
     /// Print JSON
     #[arg(long)]
     json: bool,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
-    match arguments.action {
-        Action::Show(Json { json }) => show(&global.effective()?, json),
-        Action::Check(Json { json: false }) => check(&Effective::check(&global.sources())?),
-        Action::Check(Json { json: true }) => check_json(Effective::check(&global.sources())),
+    match arguments {
+        Arguments::Show(Json { json }) => show(&global.effective()?, json),
+        Arguments::Check(Json { json: false }) => check(&Effective::check(&global.sources())?),
+        Arguments::Check(Json { json: true }) => check_json(Effective::check(&global.sources())),
     }
 }
 

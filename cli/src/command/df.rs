@@ -22,7 +22,7 @@ use crate::report::Failure;
 /// of others use it by FIPA messages. Without --df, that of this host is used. It also lists the services
 /// that agents of connected hosts have registered with their own gateways. After a search at the DF of another
 /// platform, letters to the found agents reach them by their names.
-#[derive(Debug, Args)]
+#[derive(Debug, Subcommand)]
 #[command(after_help = "\
 Examples:
   fipa df register crane lifting
@@ -31,13 +31,7 @@ Examples:
   fipa df search --type lifting --property load=5
   fipa df search --df df@jade --address http://10.0.0.7:7778/acc    at a JADE platform
   fipa df watch --type lifting")]
-pub(crate) struct Arguments {
-    #[command(subcommand)]
-    action: Action,
-}
-
-#[derive(Debug, Subcommand)]
-enum Action {
+pub(crate) enum Arguments {
     /// Run an agent that offers a service
     ///
     /// Registers the agent and its service, until Ctrl-C. The service is then deregistered.
@@ -113,7 +107,7 @@ JSON, one object on a line:
 }
 
 #[derive(Debug, Args)]
-struct Server {
+pub(crate) struct Server {
     /// Name of the directory facilitator [default: that of this host]
     #[arg(long, value_name = "NAME")]
     df: Option<AgentId>,
@@ -124,7 +118,7 @@ struct Server {
 }
 
 #[derive(Debug, Args)]
-struct Template {
+pub(crate) struct Template {
     /// Only services of this type
     #[arg(long = "type", value_name = "TYPE")]
     service_type: Option<String>,
@@ -204,8 +198,8 @@ impl Server {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    match arguments.action {
-        Action::Register {
+    match arguments {
+        Arguments::Register {
             agent,
             service_type,
             service,
@@ -221,12 +215,12 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             };
             options::block_on(register(&agent, service, &server, &config))?
         }
-        Action::Search {
+        Arguments::Search {
             template,
             server,
             json,
         } => search(&template, &server, json, &config),
-        Action::Watch {
+        Arguments::Watch {
             template,
             server,
             count,

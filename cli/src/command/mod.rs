@@ -50,6 +50,7 @@ pub(crate) enum Command {
     Subscribe(subscribe::Arguments),
     Ping(ping::Arguments),
     Coalition(coalition::Arguments),
+    #[command(subcommand)]
     Df(df::Arguments),
     Ams(ams::Arguments),
     Actions(actions::Arguments),
@@ -65,9 +66,12 @@ pub(crate) enum Command {
     Bench(bench::Arguments),
     Decode(decode::Arguments),
     Encode(encode::Arguments),
+    #[command(subcommand)]
     Content(content::Arguments),
+    #[command(subcommand)]
     Protocol(protocol::Arguments),
     Keys(keys::Arguments),
+    #[command(subcommand)]
     Config(config::Arguments),
     Completions(completions::Arguments),
     Man(man::Arguments),

@@ -16,20 +16,14 @@ use crate::report::{self, Failure};
 /// Check, format and convert content of messages in FIPA-SL
 ///
 /// FIPA-SL (FIPA00008) is the content language of FIPA messages. Input is a file, or standard input.
-#[derive(Debug, Args)]
+#[derive(Debug, Subcommand)]
 #[command(after_help = "\
 Examples:
   fipa content check goal.sl
   echo '((action crex (dock :speed 0.5)))' | fipa content format
   fipa content to-json goal.sl | jq
   fipa content to-json goal.sl | fipa content from-json")]
-pub(crate) struct Arguments {
-    #[command(subcommand)]
-    action: Action,
-}
-
-#[derive(Debug, Subcommand)]
-enum Action {
+pub(crate) enum Arguments {
     /// Check content, and print the smallest profile that has all of its expressions
     ///
     /// An error names the line, the column and the violated clause. With --profile, content that is not in
@@ -75,7 +69,7 @@ enum Action {
 }
 
 #[derive(Debug, Args)]
-struct Source {
+pub(crate) struct Source {
     /// File with the content, or - for standard input
     #[arg(default_value = "-", value_name = "FILE")]
     file: PathBuf,
@@ -86,7 +80,7 @@ struct Source {
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
-enum ContentDialect {
+pub(crate) enum ContentDialect {
     /// FIPA00008
     Standard,
     /// JADE
@@ -111,8 +105,8 @@ fn profile(text: &str) -> Result<Profile, String> {
 }
 
 pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
-    match arguments.action {
-        Action::Check { source, profile } => {
+    match arguments {
+        Arguments::Check { source, profile } => {
             let bytes = source.bytes()?;
             let content = source.parse(&bytes)?;
             if let Some(profile) = profile {
@@ -133,18 +127,18 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
             let smallest = Profile::of(&content).map_or("JADE's meta-symbols", Profile::as_str);
             output::text(&format!("{smallest}\n"))
         }
-        Action::Format { source, line, to } => {
+        Arguments::Format { source, line, to } => {
             let bytes = source.bytes()?;
             let content = source.parse(&bytes)?;
             let printer = Printer::new().dialect(to.into());
             let printer = if line { printer } else { printer.indented() };
             print(&printer, &content, &source.file)
         }
-        Action::ToJson { source } => {
+        Arguments::ToJson { source } => {
             let bytes = source.bytes()?;
             output::json(&json::of_content(&source.parse(&bytes)?))
         }
-        Action::FromJson { file, to } => {
+        Arguments::FromJson { file, to } => {
             let bytes = input::read(&file, LIMIT)?;
             let help = "see `fipa content to-json --help` for the form";
             input::check_not_empty(&bytes, &file, help)?;

@@ -7,7 +7,7 @@ mod replay;
 
 use std::path::{Path, PathBuf};
 
-use clap::{Args, Subcommand, ValueEnum};
+use clap::{Subcommand, ValueEnum};
 use fipa::monitor::projection::Projection;
 use fipa::monitor::scxml::{MAX_FILE, Mistake, ScxmlError, Warning};
 use fipa::monitor::{After, Cancel, Library, Machine, Scope, State, Subprotocol, Transition};
@@ -25,7 +25,7 @@ use crate::report::{self, Failure};
 /// The protocols of the FIPA standards are built in. Files in `monitor.protocols` of the
 /// configuration take precedence over them. A file is SCXML in the format of fipa_acl. Attributes in
 /// the namespace urn:fipa-rs:protocol add per-participant states, optional steps and timeouts.
-#[derive(Debug, Args)]
+#[derive(Debug, Subcommand)]
 #[command(after_help = "\
 Examples:
   fipa protocol list
@@ -35,13 +35,7 @@ Examples:
   fipa protocol draw fipa-request --output request.svg
   fipa protocol draw my.scxml --format mermaid
   fipa protocol replay letters.rec")]
-pub(crate) struct Arguments {
-    #[command(subcommand)]
-    action: Action,
-}
-
-#[derive(Debug, Subcommand)]
-enum Action {
+pub(crate) enum Arguments {
     /// List the known protocols with their aliases
     #[command(after_help = "\
 Examples:
@@ -164,7 +158,7 @@ JSON, one object on a line:
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Format {
+pub(crate) enum Format {
     /// Drawing for browsers and documents
     Svg,
     /// Text that GitHub and other tools render
@@ -172,18 +166,18 @@ enum Format {
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
-    match arguments.action {
-        Action::List { json } => list(&library(global)?, json),
-        Action::Show { protocol, json } => {
+    match arguments {
+        Arguments::List { json } => list(&library(global)?, json),
+        Arguments::Show { protocol, json } => {
             let machine = find(&protocol, global)?;
             if json {
                 return output::json(&as_json(&machine));
             }
             output::text(&as_text(&machine))
         }
-        Action::Export { protocol, output } => write(&exported(&protocol, global)?, output),
-        Action::Check { files, json } => check(&files, json),
-        Action::Draw {
+        Arguments::Export { protocol, output } => write(&exported(&protocol, global)?, output),
+        Arguments::Check { files, json } => check(&files, json),
+        Arguments::Draw {
             protocol,
             format,
             defaults,
@@ -196,7 +190,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             };
             write(&drawn, output)
         }
-        Action::Replay(arguments) => replay::run(&arguments, global),
+        Arguments::Replay(arguments) => replay::run(&arguments, global),
     }
 }
 
