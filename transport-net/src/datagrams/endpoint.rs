@@ -492,6 +492,7 @@ mod tests {
     use fipa_transport::{Arrival, AttemptId, Conclusion, Kind, LegacySource, Parcel, Reaction};
 
     use super::*;
+    use crate::datagrams::DatagramCore;
     use crate::udp::Core;
     use crate::{Identity, UdpLimits};
 

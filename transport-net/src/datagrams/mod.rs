@@ -65,22 +65,9 @@ pub(crate) type WithProtocol<'a, P> = dyn Fn(&mut dyn FnMut(&mut P)) + 'a;
 ///
 /// A connection that this side opens is identified by a number until [`poll_gone`](Self::poll_gone)
 /// returns that number.
-pub(crate) trait Protocol: Sized + Send + 'static {
+pub(crate) trait DatagramCore: Sized + Send + 'static {
     /// An event for the sink.
     type Event: Send;
-
-    /// The kind of transport, for locations and logs.
-    const KIND: Kind;
-
-    /// Whether the system may fragment the datagrams of this protocol.
-    const FRAGMENTS: Fragments;
-
-    /// Sets the addresses at which peers reach this endpoint.
-    fn listens_on(&mut self, listening: Vec<String>);
-
-    /// Ends the connections that are bound to addresses that this host no longer has. `local`
-    /// returns the address of a socket that belongs to one connection.
-    fn lost(&mut self, lost: &HashSet<IpAddr>, local: impl Fn(u32) -> Option<IpAddr>);
 
     /// Whether a new connection has yet to be opened.
     fn is_opening(&self, number: u32) -> bool;
@@ -88,17 +75,11 @@ pub(crate) trait Protocol: Sized + Send + 'static {
     /// Sets the paths to the peer of a new connection.
     fn begin(&mut self, now: Instant, number: u32, paths: Vec<Path>);
 
-    /// Ends a new connection that cannot be opened.
-    fn cannot_begin(&mut self, number: u32, error: TransportError);
-
     /// Handles a datagram. `listening` is whether the socket accepts datagrams of unproved peers.
     fn handle_datagram(&mut self, now: Instant, path: Path, listening: bool, bytes: &[u8]);
 
     /// Handles an error of the operating system on a path.
     fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str);
-
-    /// Handles the failure to send the last datagram because of its size.
-    fn too_big(&mut self, number: u32, size: usize);
 
     /// Returns the next datagrams to be sent.
     fn poll_transmit(&mut self, now: Instant) -> Option<Transmit>;
@@ -117,6 +98,28 @@ pub(crate) trait Protocol: Sized + Send + 'static {
 
     /// Handles the timers that are due.
     fn handle_timeout(&mut self, now: Instant);
+}
+
+/// A core as the protocol of an [`endpoint`]: with its kind of transport, and with a sink for its events.
+pub(crate) trait Protocol: DatagramCore {
+    /// The kind of transport, for locations and logs.
+    const KIND: Kind;
+
+    /// Whether the system may fragment the datagrams of this protocol.
+    const FRAGMENTS: Fragments;
+
+    /// Sets the addresses at which peers reach this endpoint.
+    fn listens_on(&mut self, listening: Vec<String>);
+
+    /// Ends the connections that are bound to addresses that this host no longer has. `local`
+    /// returns the address of a socket that belongs to one connection.
+    fn lost(&mut self, lost: &HashSet<IpAddr>, local: impl Fn(u32) -> Option<IpAddr>);
+
+    /// Ends a new connection that cannot be opened.
+    fn cannot_begin(&mut self, number: u32, error: TransportError);
+
+    /// Handles the failure to send the last datagram because of its size.
+    fn too_big(&mut self, number: u32, size: usize);
 
     /// Ends every connection.
     fn close(&mut self);

@@ -12,7 +12,7 @@ use super::config::UdpLimits;
 use super::core::{Core, CoreEvent};
 use super::packet::{self, Datagram, NO_COOKIE};
 use crate::Identity;
-use crate::datagrams::{Path, fuzzing};
+use crate::datagrams::{DatagramCore, Path, fuzzing};
 use crate::hello::{Hello, Load};
 
 /// Maximum number of datagrams sent in response to one.

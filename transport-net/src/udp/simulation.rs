@@ -16,7 +16,7 @@ use super::config::UdpLimits;
 use super::core::{Core, CoreEvent};
 use super::packet::{self, BASE, Datagram, NO_COOKIE};
 use crate::Identity;
-use crate::datagrams::{Path, Transmit};
+use crate::datagrams::{DatagramCore, Path, Transmit};
 
 const A: usize = 0;
 const B: usize = 1;

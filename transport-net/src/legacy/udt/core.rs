@@ -32,7 +32,7 @@ use super::sequence;
 use super::untranslated::{Translation, Untranslated};
 use crate::datagrams::connections::{Connections, Scheduled};
 use crate::datagrams::cookie::Cookies;
-use crate::datagrams::{Outbound, Path, Random, Transmit};
+use crate::datagrams::{DatagramCore, Outbound, Path, Random, Transmit};
 use crate::end::ConnectionEnd;
 use crate::rate_limit::{PeerRateLimits, is_one_peer};
 use crate::stream::budget::ByteBudget;
@@ -253,33 +253,6 @@ impl Core {
         }
     }
 
-    /// Whether a new connection has yet to be opened.
-    pub(crate) fn is_opening(&self, number: u32) -> bool {
-        let entry = self.connections.get(number);
-        entry.is_some_and(|entry| entry.connection.is_opening())
-    }
-
-    /// Sets the paths to the peer of a new connection.
-    pub(crate) fn begin(&mut self, now: Instant, number: u32, mut paths: Vec<Path>) {
-        let Some(remote) = paths.first().map(|path| path.remote) else {
-            return;
-        };
-        paths.retain(|path| (self.access)(path.remote.ip()));
-        if paths.is_empty() {
-            let detail = format!(
-                "{remote} is a legacy peer, which cannot prove its identity, and is not listed in security.legacy_peers"
-            );
-            let error = TransportError::new(TransportErrorKind::Refused, detail);
-            return self.end(now, number, &ConnectionEnd::NotOpened(error));
-        }
-        self.with(now, number, |connection, _| {
-            if let Some(dialing) = connection.dialing_mut() {
-                dialing.begin(paths, now);
-            }
-            Ok(())
-        });
-    }
-
     /// Ends a new connection that cannot be opened.
     pub(crate) fn cannot_begin(&mut self, now: Instant, number: u32, error: TransportError) {
         self.end(now, number, &ConnectionEnd::NotOpened(error));
@@ -306,125 +279,6 @@ impl Core {
         let end = sender.map_or(Abandoned::Unconfirmed, |sender| sender.abandon(attempt));
         self.connections.touch(*number);
         end
-    }
-
-    /// Handles a datagram. `listening` is whether the socket accepts datagrams of unproved peers.
-    pub(crate) fn handle_datagram(
-        &mut self,
-        now: Instant,
-        path: Path,
-        listening: bool,
-        bytes: &[u8],
-    ) {
-        let Some((to, packet)) = Packet::read(bytes) else {
-            self.counters.ignored += 1;
-            return;
-        };
-        if let (0, Packet::Control(Control::Handshake(handshake)), true) = (to, &packet, listening)
-        {
-            return self.handle_request(now, path, handshake);
-        }
-        let number = self.sockets.get(&to).copied();
-        let entry = number.and_then(|number| Some((number, self.connections.get_mut(number)?)));
-        let Some((number, entry)) = entry else {
-            self.counters.ignored += 1;
-            return;
-        };
-        let is_its = match (entry.connection.path(), entry.connection.dialing_mut()) {
-            (Some(its), _) => its.remote == path.remote,
-            (None, Some(dialing)) => dialing.uses(path),
-            (None, None) => false,
-        };
-        if !is_its {
-            self.counters.ignored += 1;
-            return;
-        }
-        self.with(now, number, |connection, counters| match &packet {
-            Packet::Control(Control::Handshake(handshake)) => {
-                let was_opening = connection.is_opening();
-                connection.handle_handshake(path, handshake, now)?;
-                counters.dialed += u64::from(was_opening && !connection.is_opening());
-                Ok(())
-            }
-            _ if connection.is_opening() => {
-                counters.ignored += 1;
-                Ok(())
-            }
-            Packet::Data(data) => {
-                connection.handle_data(data, now, counters);
-                Ok(())
-            }
-            Packet::Control(control) => connection.handle_control(control, now, counters),
-        });
-    }
-
-    /// Handles an error of the operating system on a path.
-    pub(crate) fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str) {
-        self.with(now, number, |connection, _| {
-            match connection.dialing_mut() {
-                Some(dialing) => dialing.failed(path, what, now),
-                None => Err(ConnectionEnd::Broken(what.to_owned())),
-            }
-        });
-    }
-
-    pub(crate) fn poll_transmit(&mut self, now: Instant) -> Option<Transmit> {
-        if let Some((path, contents)) = self.outbox.pop_front() {
-            return Some(Transmit {
-                connection: None,
-                path,
-                contents,
-                segment: None,
-            });
-        }
-        let counters = &mut self.counters;
-        let (number, (path, contents, segment)) = self
-            .connections
-            .poll_ready(|entry| entry.connection.poll_transmit(now, counters))?;
-        Some(Transmit {
-            connection: Some(number),
-            path,
-            contents,
-            segment,
-        })
-    }
-
-    pub(crate) fn poll_event(&mut self) -> Option<CoreEvent> {
-        if let Some((attempt, conclusion)) = self.concluded.pop_front() {
-            return Some(CoreEvent::Concluded(attempt, conclusion));
-        }
-        // They came before those of a later connection of the same peer.
-        if let Some(arrived) = self.arrived.pop_front() {
-            return Some(arrived);
-        }
-        let counters = &mut self.counters;
-        self.connections.poll_eventful(|_, entry| {
-            if let Some((attempt, conclusion)) = entry.connection.poll_concluded() {
-                counters.letters_out += 1;
-                return Some(CoreEvent::Concluded(attempt, conclusion));
-            }
-            next_arrival(&mut entry.connection, counters)
-        })
-    }
-
-    /// Whether there are events to deliver.
-    pub(crate) fn has_events(&self) -> bool {
-        !self.concluded.is_empty() || !self.arrived.is_empty() || self.connections.has_events()
-    }
-
-    /// Returns the next removed connection, so that its sockets can be closed.
-    pub(crate) fn poll_gone(&mut self) -> Option<u32> {
-        self.connections.poll_gone()
-    }
-
-    pub(crate) fn poll_timeout(&self) -> Option<Instant> {
-        self.connections.poll_timeout()
-    }
-
-    pub(crate) fn handle_timeout(&mut self, now: Instant) {
-        for number in self.connections.due(now) {
-            self.with(now, number, |connection, _| connection.handle_timeout(now));
-        }
     }
 
     /// Ends every connection, and concludes every letter.
@@ -655,6 +509,144 @@ impl Core {
             if socket != 0 && !self.sockets.contains_key(&socket) {
                 return socket;
             }
+        }
+    }
+}
+
+impl DatagramCore for Core {
+    type Event = CoreEvent;
+
+    fn is_opening(&self, number: u32) -> bool {
+        let entry = self.connections.get(number);
+        entry.is_some_and(|entry| entry.connection.is_opening())
+    }
+
+    fn begin(&mut self, now: Instant, number: u32, mut paths: Vec<Path>) {
+        let Some(remote) = paths.first().map(|path| path.remote) else {
+            return;
+        };
+        paths.retain(|path| (self.access)(path.remote.ip()));
+        if paths.is_empty() {
+            let detail = format!(
+                "{remote} is a legacy peer, which cannot prove its identity, and is not listed in security.legacy_peers"
+            );
+            let error = TransportError::new(TransportErrorKind::Refused, detail);
+            return self.end(now, number, &ConnectionEnd::NotOpened(error));
+        }
+        self.with(now, number, |connection, _| {
+            if let Some(dialing) = connection.dialing_mut() {
+                dialing.begin(paths, now);
+            }
+            Ok(())
+        });
+    }
+
+    fn handle_datagram(&mut self, now: Instant, path: Path, listening: bool, bytes: &[u8]) {
+        let Some((to, packet)) = Packet::read(bytes) else {
+            self.counters.ignored += 1;
+            return;
+        };
+        if let (0, Packet::Control(Control::Handshake(handshake)), true) = (to, &packet, listening)
+        {
+            return self.handle_request(now, path, handshake);
+        }
+        let number = self.sockets.get(&to).copied();
+        let entry = number.and_then(|number| Some((number, self.connections.get_mut(number)?)));
+        let Some((number, entry)) = entry else {
+            self.counters.ignored += 1;
+            return;
+        };
+        let is_its = match (entry.connection.path(), entry.connection.dialing_mut()) {
+            (Some(its), _) => its.remote == path.remote,
+            (None, Some(dialing)) => dialing.uses(path),
+            (None, None) => false,
+        };
+        if !is_its {
+            self.counters.ignored += 1;
+            return;
+        }
+        self.with(now, number, |connection, counters| match &packet {
+            Packet::Control(Control::Handshake(handshake)) => {
+                let was_opening = connection.is_opening();
+                connection.handle_handshake(path, handshake, now)?;
+                counters.dialed += u64::from(was_opening && !connection.is_opening());
+                Ok(())
+            }
+            _ if connection.is_opening() => {
+                counters.ignored += 1;
+                Ok(())
+            }
+            Packet::Data(data) => {
+                connection.handle_data(data, now, counters);
+                Ok(())
+            }
+            Packet::Control(control) => connection.handle_control(control, now, counters),
+        });
+    }
+
+    fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str) {
+        self.with(now, number, |connection, _| {
+            match connection.dialing_mut() {
+                Some(dialing) => dialing.failed(path, what, now),
+                None => Err(ConnectionEnd::Broken(what.to_owned())),
+            }
+        });
+    }
+
+    fn poll_transmit(&mut self, now: Instant) -> Option<Transmit> {
+        if let Some((path, contents)) = self.outbox.pop_front() {
+            return Some(Transmit {
+                connection: None,
+                path,
+                contents,
+                segment: None,
+            });
+        }
+        let counters = &mut self.counters;
+        let (number, (path, contents, segment)) = self
+            .connections
+            .poll_ready(|entry| entry.connection.poll_transmit(now, counters))?;
+        Some(Transmit {
+            connection: Some(number),
+            path,
+            contents,
+            segment,
+        })
+    }
+
+    fn poll_event(&mut self) -> Option<CoreEvent> {
+        if let Some((attempt, conclusion)) = self.concluded.pop_front() {
+            return Some(CoreEvent::Concluded(attempt, conclusion));
+        }
+        // They came before those of a later connection of the same peer.
+        if let Some(arrived) = self.arrived.pop_front() {
+            return Some(arrived);
+        }
+        let counters = &mut self.counters;
+        self.connections.poll_eventful(|_, entry| {
+            if let Some((attempt, conclusion)) = entry.connection.poll_concluded() {
+                counters.letters_out += 1;
+                return Some(CoreEvent::Concluded(attempt, conclusion));
+            }
+            next_arrival(&mut entry.connection, counters)
+        })
+    }
+
+    fn has_events(&self) -> bool {
+        !self.concluded.is_empty() || !self.arrived.is_empty() || self.connections.has_events()
+    }
+
+    fn poll_gone(&mut self) -> Option<u32> {
+        self.connections.poll_gone()
+    }
+
+    fn poll_timeout(&self) -> Option<Instant> {
+        self.connections.poll_timeout()
+    }
+
+    fn handle_timeout(&mut self, now: Instant) {
+        for number in self.connections.due(now) {
+            self.with(now, number, |connection, _| connection.handle_timeout(now));
         }
     }
 }

@@ -16,7 +16,7 @@ use super::packet::{
     Position, REQUEST, VERSION,
 };
 use super::sequence;
-use crate::datagrams::{Path, fuzzing};
+use crate::datagrams::{DatagramCore, Path, fuzzing};
 
 /// Maximum number of packets sent in response to one.
 const MOST: usize = 100_000;

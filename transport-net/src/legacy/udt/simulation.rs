@@ -18,7 +18,7 @@ use super::packet::{
     REFUSAL, REQUEST, VERSION,
 };
 use super::untranslated::Translation;
-use crate::datagrams::{Path, Transmit};
+use crate::datagrams::{DatagramCore, Path, Transmit};
 
 const A: usize = 0;
 const B: usize = 1;

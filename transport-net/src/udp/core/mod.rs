@@ -30,7 +30,7 @@ use crate::Identity;
 use crate::address;
 use crate::datagrams::connections::{Connections, Scheduled};
 use crate::datagrams::cookie::Cookies;
-use crate::datagrams::{Outbound, Path, Random, Transmit};
+use crate::datagrams::{DatagramCore, Outbound, Path, Random, Transmit};
 use crate::end::ConnectionEnd;
 use crate::rate_limit::{PeerRateLimit, PeerRateLimits, is_one_peer};
 use crate::stream::budget::{ByteBudget, Meter};
@@ -231,22 +231,6 @@ impl Core {
         }
     }
 
-    /// Whether a new connection has yet to be opened.
-    pub(crate) fn is_opening(&self, number: u32) -> bool {
-        let entry = self.connections.get(number);
-        entry.is_some_and(|entry| entry.connection.is_opening())
-    }
-
-    /// Sets the paths to the peer of a new connection.
-    pub(crate) fn begin(&mut self, now: Instant, number: u32, paths: Vec<Path>) {
-        self.with(number, |connection, _| {
-            if let Some(dialing) = connection.dialing_mut() {
-                dialing.begin(paths, now);
-            }
-            Ok(())
-        });
-    }
-
     /// Ends a new connection that cannot be opened.
     pub(crate) fn cannot_begin(&mut self, number: u32, error: TransportError) {
         self.end(number, &ConnectionEnd::NotOpened(error));
@@ -280,141 +264,9 @@ impl Core {
         });
     }
 
-    /// Handles a datagram. `listening` is whether the socket accepts datagrams of unproved peers.
-    pub(crate) fn handle_datagram(
-        &mut self,
-        now: Instant,
-        path: Path,
-        listening: bool,
-        bytes: &[u8],
-    ) {
-        let Some(datagram) = Datagram::read(bytes) else {
-            self.counters.ignored += 1;
-            return;
-        };
-        match datagram {
-            Datagram::Hello {
-                initiator,
-                cookie,
-                hello,
-            } if listening => self.handle_hello(now, path, initiator, &cookie, hello),
-            Datagram::Cookie { to, cookie } => {
-                self.of_dialing(to, path, |_, connection| {
-                    if let Some(dialing) = connection.dialing_mut() {
-                        dialing.handle_cookie(path, cookie, now);
-                    }
-                    Ok(())
-                });
-            }
-            Datagram::Welcome {
-                to,
-                acceptor,
-                hello,
-            } => self.welcome(now, path, to, acceptor, hello),
-            Datagram::Refused { to } => {
-                self.of_dialing(to, path, |_, _| {
-                    let detail = "the peer refused the connection: its max_connections is reached, or it is connected \
-                                  with this service already";
-                    Err(ConnectionEnd::NotOpened(TransportError::new(TransportErrorKind::Refused, detail)))
-                });
-            }
-            Datagram::Unknown { number } => self.is_unknown(path, number),
-            Datagram::Data { to, number, frames } => {
-                let entry = self.ids.get(&to).copied();
-                let from = entry
-                    .and_then(|entry| self.connections.get(entry))
-                    .and_then(|entry| entry.connection.path())
-                    .map(|path| path.remote);
-                match entry {
-                    Some(entry) if from == Some(path.remote) => {
-                        self.with(entry, |connection, counters| {
-                            connection.handle_packet(number, frames, now, counters)
-                        });
-                    }
-                    Some(_) => self.counters.ignored += 1,
-                    None => {
-                        self.counters.ignored += 1;
-                        if listening {
-                            self.reply(path, packet::unknown(to));
-                        }
-                    }
-                }
-            }
-            Datagram::Hello { .. } => self.counters.ignored += 1,
-        }
-    }
-
-    /// Handles an error of the operating system on a path.
-    pub(crate) fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str) {
-        self.with(number, |connection, _| match connection.dialing_mut() {
-            Some(dialing) => dialing.failed(path, what, now),
-            None => Err(ConnectionEnd::Broken(what.to_owned())),
-        });
-    }
-
     /// Handles the failure to send the last datagram because of its size.
     pub(crate) fn too_big(&mut self, number: u32, size: usize) {
         self.with(number, |connection, _| connection.too_big(size));
-    }
-
-    pub(crate) fn poll_transmit(&mut self, now: Instant) -> Option<Transmit> {
-        if let Some((path, contents)) = self.outbox.pop_front() {
-            return Some(Transmit {
-                connection: None,
-                path,
-                contents,
-                segment: None,
-            });
-        }
-        let counters = &mut self.counters;
-        let (number, (path, contents)) = self
-            .connections
-            .poll_ready(|entry| entry.connection.poll_transmit(now, counters))?;
-        Some(Transmit {
-            connection: Some(number),
-            path,
-            contents,
-            segment: None,
-        })
-    }
-
-    pub(crate) fn poll_event(&mut self) -> Option<CoreEvent> {
-        if let Some(event) = self.notes.pop_front() {
-            return Some(event);
-        }
-        self.connections.poll_eventful(|number, entry| {
-            match (entry.connection.poll_event()?, &entry.peer) {
-                (Event::Concluded(attempt, conclusion), _) => {
-                    Some(CoreEvent::Concluded(attempt, conclusion))
-                }
-                (Event::Arrived { id, parcel }, Some(peer)) => Some(CoreEvent::Arrived {
-                    parcel,
-                    from: peer.hop.clone(),
-                    ticket: Ticket(u64::from(number) * MAX_ID + id),
-                }),
-                (Event::Arrived { .. }, None) => None,
-            }
-        })
-    }
-
-    /// Whether there are events to deliver.
-    pub(crate) fn has_events(&self) -> bool {
-        !self.notes.is_empty() || self.connections.has_events()
-    }
-
-    /// Returns the next removed connection, so that its sockets can be closed.
-    pub(crate) fn poll_gone(&mut self) -> Option<u32> {
-        self.connections.poll_gone()
-    }
-
-    pub(crate) fn poll_timeout(&self) -> Option<Instant> {
-        self.connections.poll_timeout()
-    }
-
-    pub(crate) fn handle_timeout(&mut self, now: Instant) {
-        for number in self.connections.due(now) {
-            self.with(number, |connection, _| connection.handle_timeout(now));
-        }
     }
 
     /// Ends every connection.
@@ -560,6 +412,146 @@ impl Core {
             if id != 0 && !self.ids.contains_key(&id) {
                 return id;
             }
+        }
+    }
+}
+
+impl DatagramCore for Core {
+    type Event = CoreEvent;
+
+    fn is_opening(&self, number: u32) -> bool {
+        let entry = self.connections.get(number);
+        entry.is_some_and(|entry| entry.connection.is_opening())
+    }
+
+    fn begin(&mut self, now: Instant, number: u32, paths: Vec<Path>) {
+        self.with(number, |connection, _| {
+            if let Some(dialing) = connection.dialing_mut() {
+                dialing.begin(paths, now);
+            }
+            Ok(())
+        });
+    }
+
+    fn handle_datagram(&mut self, now: Instant, path: Path, listening: bool, bytes: &[u8]) {
+        let Some(datagram) = Datagram::read(bytes) else {
+            self.counters.ignored += 1;
+            return;
+        };
+        match datagram {
+            Datagram::Hello {
+                initiator,
+                cookie,
+                hello,
+            } if listening => self.handle_hello(now, path, initiator, &cookie, hello),
+            Datagram::Cookie { to, cookie } => {
+                self.of_dialing(to, path, |_, connection| {
+                    if let Some(dialing) = connection.dialing_mut() {
+                        dialing.handle_cookie(path, cookie, now);
+                    }
+                    Ok(())
+                });
+            }
+            Datagram::Welcome {
+                to,
+                acceptor,
+                hello,
+            } => self.welcome(now, path, to, acceptor, hello),
+            Datagram::Refused { to } => {
+                self.of_dialing(to, path, |_, _| {
+                    let detail = "the peer refused the connection: its max_connections is reached, or it is connected \
+                                  with this service already";
+                    Err(ConnectionEnd::NotOpened(TransportError::new(TransportErrorKind::Refused, detail)))
+                });
+            }
+            Datagram::Unknown { number } => self.is_unknown(path, number),
+            Datagram::Data { to, number, frames } => {
+                let entry = self.ids.get(&to).copied();
+                let from = entry
+                    .and_then(|entry| self.connections.get(entry))
+                    .and_then(|entry| entry.connection.path())
+                    .map(|path| path.remote);
+                match entry {
+                    Some(entry) if from == Some(path.remote) => {
+                        self.with(entry, |connection, counters| {
+                            connection.handle_packet(number, frames, now, counters)
+                        });
+                    }
+                    Some(_) => self.counters.ignored += 1,
+                    None => {
+                        self.counters.ignored += 1;
+                        if listening {
+                            self.reply(path, packet::unknown(to));
+                        }
+                    }
+                }
+            }
+            Datagram::Hello { .. } => self.counters.ignored += 1,
+        }
+    }
+
+    fn handle_error(&mut self, now: Instant, number: u32, path: Path, what: &str) {
+        self.with(number, |connection, _| match connection.dialing_mut() {
+            Some(dialing) => dialing.failed(path, what, now),
+            None => Err(ConnectionEnd::Broken(what.to_owned())),
+        });
+    }
+
+    fn poll_transmit(&mut self, now: Instant) -> Option<Transmit> {
+        if let Some((path, contents)) = self.outbox.pop_front() {
+            return Some(Transmit {
+                connection: None,
+                path,
+                contents,
+                segment: None,
+            });
+        }
+        let counters = &mut self.counters;
+        let (number, (path, contents)) = self
+            .connections
+            .poll_ready(|entry| entry.connection.poll_transmit(now, counters))?;
+        Some(Transmit {
+            connection: Some(number),
+            path,
+            contents,
+            segment: None,
+        })
+    }
+
+    fn poll_event(&mut self) -> Option<CoreEvent> {
+        if let Some(event) = self.notes.pop_front() {
+            return Some(event);
+        }
+        self.connections.poll_eventful(|number, entry| {
+            match (entry.connection.poll_event()?, &entry.peer) {
+                (Event::Concluded(attempt, conclusion), _) => {
+                    Some(CoreEvent::Concluded(attempt, conclusion))
+                }
+                (Event::Arrived { id, parcel }, Some(peer)) => Some(CoreEvent::Arrived {
+                    parcel,
+                    from: peer.hop.clone(),
+                    ticket: Ticket(u64::from(number) * MAX_ID + id),
+                }),
+                (Event::Arrived { .. }, None) => None,
+            }
+        })
+    }
+
+    fn has_events(&self) -> bool {
+        !self.notes.is_empty() || self.connections.has_events()
+    }
+
+    fn poll_gone(&mut self) -> Option<u32> {
+        self.connections.poll_gone()
+    }
+
+    fn poll_timeout(&self) -> Option<Instant> {
+        self.connections.poll_timeout()
+    }
+
+    fn handle_timeout(&mut self, now: Instant) {
+        for number in self.connections.due(now) {
+            self.with(number, |connection, _| connection.handle_timeout(now));
         }
     }
 }
