@@ -105,7 +105,9 @@ fn part<'a, F: Notation, N: Notes>(
                 let Some(depth) = depth.checked_sub(1) else {
                     return Err(reader.error(F::CLAUSE, Problem::TooDeep("resolvers")));
                 };
-                return Ok(Some(Part::Resolver(agent_id::<F, N>(reader, depth)?)));
+                // Resolvers are rare: the fast path would only make this function larger.
+                let resolver = agent_id_slow::<F, N>(reader, depth)?;
+                return Ok(Some(Part::Resolver(resolver)));
             }
             List::Outside => {}
         }

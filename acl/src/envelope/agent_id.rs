@@ -25,7 +25,7 @@ impl Notation for InEnvelopes {
         reader.short_bare_name()
     }
 
-    #[inline]
+    #[inline(always)]
     fn text<'a, N: Notes>(
         reader: &mut Reader<'a, N>,
         what: &'static str,
