@@ -207,6 +207,27 @@ pub(crate) async fn register(
     registered.map_err(|error| not_registered(error, name, config))
 }
 
+/// Runs `work` as an agent of the domain, and leaves the domain after it.
+pub(crate) fn run_agent(
+    config: &Config,
+    register: impl AsyncFnOnce(&Domain) -> Result<Agent, Failure>,
+    work: impl AsyncFnOnce(&Agent, &mut Stop) -> Result<(), Failure>,
+) -> Result<(), Failure> {
+    options::block_on(async {
+        let mut stop = Stop::listen()?;
+        let domain = join(config).await?;
+        let agent = register(&domain).await;
+        let done = match &agent {
+            Ok(agent) => work(agent, &mut stop).await,
+            Err(_) => Ok(()),
+        };
+        Stop::ending();
+        let registered = agent.map(drop);
+        domain.close().await;
+        registered.and(done)
+    })?
+}
+
 // The agent of a command that receives messages, and the command's end. Not a doc comment: clap would print
 // it as the help of the command.
 #[derive(Debug, Args)]

@@ -1,5 +1,4 @@
-//! What stands for `checks.rs`, `demultiplexer.rs` and `lock_slot.rs` in a build without the feature `protocols`:
-//! nothing is checked, no call leads a conversation, and there are no locks.
+//! Stands for `checks.rs`, `demultiplexer.rs` and `lock_slot.rs` in a build without the feature `protocols`: nothing is checked, no call leads a conversation, and there are no locks.
 
 use fipa_acl::Message;
 use fipa_mts::core::Received;

@@ -225,21 +225,22 @@ impl Service {
     /// have. The locations for legacy peers only are left out: services that confirm deliveries must
     /// not use them.
     pub(crate) fn locations(&self) -> Vec<Location> {
+        self.best_locations(|location| location.signature() == Signature::Frames)
+    }
+
+    fn best_locations(&self, is_used: impl Fn(&Location) -> bool) -> Vec<Location> {
         let locations = self.locations.borrow();
-        let framed = locations.iter();
-        let framed = framed.filter(|location| location.signature() == Signature::Frames);
-        best(framed.cloned().collect())
+        let used = locations.iter().filter(|location| is_used(location));
+        best(used.cloned().collect())
     }
 
     /// Returns the locations that other hosts may learn: those for directories, and the UDT ones, by which only legacy
     /// peers reach an agent.
     #[cfg(feature = "net")]
     pub(crate) fn announced_locations(&self) -> Vec<Location> {
-        let locations = self.locations.borrow();
-        let announced = locations.iter().filter(|location| {
+        self.best_locations(|location| {
             location.signature() == Signature::Frames || location.kind() == Kind::Udt
-        });
-        best(announced.cloned().collect())
+        })
     }
 
     /// Returns a receiver that is notified of changes of the locations.
@@ -386,7 +387,7 @@ fn used<'a>(config: &'a Config, role: &Role<'_>) -> impl Iterator<Item = Kind> +
     })
 }
 
-/// What the transports of a service are made of.
+/// The parts from which the transports of a service are made.
 struct TransportParts<'a> {
     config: &'a Config,
     role: &'a Role<'a>,

@@ -357,9 +357,13 @@ impl Dialogue {
         self.speaker.post_within(message, due)
     }
 
-    /// Sends a message, and waits for the outcome.
-    pub(super) async fn say(&mut self, message: MessageBuilder) -> Result<(), DialogueError> {
-        let sent = self.post(message, None)?;
+    /// Sends a message like [`post`](Self::post), and waits for the outcome.
+    pub(super) async fn say(
+        &mut self,
+        message: MessageBuilder,
+        due: Option<Instant>,
+    ) -> Result<(), DialogueError> {
+        let sent = self.post(message, due)?;
         only_delivered(&self.outcomes(sent).await)
     }
 
@@ -367,7 +371,7 @@ impl Dialogue {
     pub(super) fn post_until(
         &mut self,
         message: MessageBuilder,
-        deadline: Option<Duration>,
+        deadline: Duration,
     ) -> Result<Sent, DialogueError> {
         self.speaker.post_until(message, deadline)
     }
@@ -385,8 +389,8 @@ impl Dialogue {
         content: impl Into<bytes::Bytes>,
         due: Option<Instant>,
     ) -> Result<(), DialogueError> {
-        let sent = self.post_answer(to, act, content, due)?;
-        only_delivered(&self.outcomes(sent).await)
+        let answer = self.agent().endpoint.reply(to, act).content(content);
+        self.say(answer, due).await
     }
 
     /// Answers a message without waiting for the outcome, so that an unreachable agent does not delay
@@ -636,10 +640,9 @@ impl Speaker {
 
     fn post_within(
         &mut self,
-        message: MessageBuilder,
+        mut message: MessageBuilder,
         due: Option<Instant>,
     ) -> Result<Sent, DialogueError> {
-        let mut message = message;
         let mut deadline = self.core.endpoint.domain.inner.deadline;
         if let Some(due) = due {
             let left = due.saturating_duration_since(Instant::now());
@@ -655,10 +658,9 @@ impl Speaker {
     fn post_until(
         &mut self,
         message: MessageBuilder,
-        deadline: Option<Duration>,
+        deadline: Duration,
     ) -> Result<Sent, DialogueError> {
         let message = message.protocol(self.protocol.as_str());
-        let deadline = deadline.unwrap_or(self.core.endpoint.domain.inner.deadline);
         self.post_by(message, deadline)
     }
 

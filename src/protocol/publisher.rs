@@ -61,13 +61,12 @@ impl Agent {
     pub fn publisher(&self, topic: impl Into<Topic>) -> Result<Publisher, DialogueError> {
         let topic: Topic = topic.into();
         let name = topic.name().to_owned();
-        let wanted = name.clone();
         let opens = opening(&self.core, "fipa-subscribe", move |message| {
-            message.content().is_some_and(|content| *content == wanted)
+            message.content().is_some_and(|content| *content == name)
         })?;
         let runtime = &self.core.endpoint.domain.inner.service.runtime;
         let state = State {
-            is_stream: topic.declared_rate().is_some(),
+            is_stream: topic.rate.is_some(),
             ..State::default()
         };
         let shared = Arc::new(Shared {
@@ -77,7 +76,7 @@ impl Agent {
         });
         let queue = ServedQueue::new(&self.core, opens);
         let task = runtime.spawn(accept(queue, Arc::clone(&shared)));
-        declare(&self.core, &name)?;
+        declare(&self.core, shared.topic.name())?;
         Ok(Publisher {
             shared,
             task,
@@ -135,7 +134,7 @@ struct Subscriber {
 #[derive(Debug)]
 struct Waiting {
     sample: Sample,
-    /// Receives what became of it. `None` for a latched sample.
+    /// Receives the result. `None` for a latched sample.
     result: Option<oneshot::Sender<NotificationResult>>,
 }
 
@@ -186,7 +185,7 @@ impl Publication {
     }
 }
 
-/// The result of a notification at one subscriber.
+/// A subscriber, and the result of a notification for it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Notified {
     /// The name of the subscriber.
@@ -195,7 +194,7 @@ pub struct Notified {
     pub result: NotificationResult,
 }
 
-/// What became of a notification for one subscriber.
+/// The result of a notification for one subscriber.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum NotificationResult {
@@ -235,7 +234,7 @@ impl fmt::Debug for TopicLoan {
 
 impl Publisher {
     /// Sends a notification (`inform`) with this content to all subscribers. Returns when it waits for each of them;
-    /// [`Publication::results`] has what became of it.
+    /// [`Publication::results`] has the results.
     ///
     /// The notifications of several calls arrive in the order of the calls. A subscriber that keeps the newest ones
     /// never delays the call. One that asks for all, or is a partner that cannot ask, and has 64 that wait, delays it
@@ -280,7 +279,7 @@ impl Publisher {
     }
 
     async fn hand_over(&self, content: Bytes) -> Publication {
-        let until = Instant::now() + self.shared.topic.wait();
+        let until = Instant::now() + self.shared.topic.wait;
         loop {
             // Created before the check, so that no room after the check is missed.
             let room = self.shared.room.notified();
@@ -339,9 +338,9 @@ impl Shared {
             content,
             published: SystemTime::now(),
         };
-        if self.topic.kept() > 0 {
+        if self.topic.latched > 0 {
             state.latched.push_back(sample.clone());
-            while state.latched.len() > self.topic.kept() {
+            while state.latched.len() > self.topic.latched {
                 state.latched.pop_front();
             }
         }
@@ -504,7 +503,7 @@ async fn serve(
         Some(keep) => agree.user_defined(topic::DELIVERY, keep.to_string()),
         None => agree,
     };
-    let served = match dialogue.say(agree).await {
+    let served = match dialogue.say(agree, None).await {
         Ok(()) => notify(&mut dialogue, first, shared, number, &added).await,
         Err(error) => Err(error),
     };
@@ -614,11 +613,10 @@ fn send(
     let notification = topic::marked(notification, sample.number, sample.published, keep);
     // With a short deadline, each end of it would leave one more outdated content in the queue of a subscriber that
     // is stopped.
-    let deadline = match keep {
-        Keep::Latest(_) => Some(MAX_DEADLINE),
-        _ => None,
+    let sent = match keep {
+        Keep::Latest(_) => dialogue.post_until(notification, MAX_DEADLINE)?,
+        _ => dialogue.post(notification, None)?,
     };
-    let sent = dialogue.post_until(notification, deadline)?;
     Ok(UnderWay {
         outcomes: Box::pin(deliveries(sent)),
         result,

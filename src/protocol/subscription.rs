@@ -192,6 +192,15 @@ struct Received {
     restarted: bool,
 }
 
+impl From<Message> for Received {
+    fn from(message: Message) -> Self {
+        Self {
+            message,
+            restarted: false,
+        }
+    }
+}
+
 /// The task that reads the notifications of a topic.
 struct Reader {
     queue: Arc<Queue>,
@@ -313,7 +322,7 @@ impl QueueState {
 struct Begun {
     dialogue: Dialogue,
     receivers: Vec<AgentId>,
-    /// What the partner answered to the wish; `None` if it does not know topics.
+    /// The answer of the partner to the wish; `None` if it does not know topics.
     keep: Option<Keep>,
     early: Option<Message>,
 }
@@ -368,6 +377,7 @@ impl Subscription {
             let reading = Reading {
                 core: Arc::clone(core),
                 subscribe,
+                receivers: receivers.clone(),
                 timeout,
                 dialogue: Arc::clone(&dialogue),
                 queue: Arc::clone(&queue),
@@ -435,10 +445,7 @@ impl Subscription {
         // Dropping the wait of the stream loses no message.
         self.waiting = None;
         let received = match self.early.take() {
-            Some(message) => Ok(Received {
-                message,
-                restarted: false,
-            }),
+            Some(message) => Ok(message.into()),
             None => self.wait().await,
         };
         self.returned(received)
@@ -453,13 +460,7 @@ impl Subscription {
             }
             None => {
                 let dialogue = Arc::clone(&self.dialogue);
-                Box::pin(async move {
-                    let message = read(&dialogue).await?;
-                    Ok(Received {
-                        message,
-                        restarted: false,
-                    })
-                })
+                Box::pin(async move { read(&dialogue).await.map(Received::from) })
             }
         }
     }
@@ -527,6 +528,7 @@ async fn read(dialogue: &Mutex<Dialogue>) -> Result<Message, DialogueError> {
 struct Reading {
     core: Arc<AgentCore>,
     subscribe: MessageBuilder,
+    receivers: Vec<AgentId>,
     timeout: Duration,
     dialogue: Arc<Mutex<Dialogue>>,
     queue: Arc<Queue>,
@@ -598,8 +600,7 @@ impl Reading {
     }
 
     fn is_publisher(&self, name: &str) -> bool {
-        let receivers = self.subscribe.clone().build();
-        receivers.is_ok_and(|message| message.receivers().iter().any(|it| it.name() == name))
+        self.receivers.iter().any(|it| it.name() == name)
     }
 }
 
@@ -609,8 +610,7 @@ impl Stream for Subscription {
     fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let this = self.get_mut();
         if let Some(message) = this.early.take() {
-            let restarted = false;
-            return Poll::Ready(Some(this.returned(Ok(Received { message, restarted }))));
+            return Poll::Ready(Some(this.returned(Ok(message.into()))));
         }
         if this.is_over {
             return Poll::Ready(None);

@@ -107,9 +107,12 @@ impl FromStr for Keep {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Topic {
     name: String,
-    rate: Option<f64>,
-    latched: usize,
-    wait: Duration,
+    /// Notifications per second, if they are known.
+    pub(super) rate: Option<f64>,
+    /// Number of contents that are kept for new subscribers.
+    pub(super) latched: usize,
+    /// Time for which a publication waits for a slow subscriber.
+    pub(super) wait: Duration,
 }
 
 /// Time for which a publisher waits for a slow subscriber by default.
@@ -153,18 +156,6 @@ impl Topic {
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
-    }
-
-    pub(super) fn declared_rate(&self) -> Option<f64> {
-        self.rate
-    }
-
-    pub(super) fn kept(&self) -> usize {
-        self.latched
-    }
-
-    pub(super) fn wait(&self) -> Duration {
-        self.wait
     }
 }
 

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use clap::Args;
 use fipa::error::ErrorChain;
 use fipa::protocol::{NotificationResult, Notified, Publication, Publisher, Topic};
-use fipa::{Agent, AgentId, Message, RegisterOptions};
+use fipa::{Agent, AgentId, Domain, Message, RegisterOptions};
 use fipa_acl::{escape, escape_name};
 use serde_json::json;
 use tokio::sync::mpsc;
@@ -92,27 +92,18 @@ enum Values {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    options::block_on(async {
-        let mut stop = Stop::listen()?;
-        let domain = membership::join(&config).await?;
+    let register = async |domain: &Domain| {
         let options = RegisterOptions {
             agent_type: "publisher".to_owned(),
-            description: String::new(),
+            ..RegisterOptions::default()
         };
-        let name = arguments.name.name();
-        let agent = membership::register(&domain, name, options, &config).await;
-        let done = match &agent {
-            Ok(agent) => publish(agent, arguments, &mut stop).await,
-            Err(_) => Ok(()),
-        };
-        Stop::ending();
-        let registered = agent.map(drop);
-        domain.close().await;
-        registered.and(done)
-    })?
+        membership::register(domain, arguments.name.name(), options, &config).await
+    };
+    let publish = async |agent: &Agent, stop: &mut Stop| publish(agent, &arguments, stop).await;
+    membership::run_agent(&config, register, publish)
 }
 
-async fn publish(agent: &Agent, arguments: Arguments, stop: &mut Stop) -> Result<(), Failure> {
+async fn publish(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result<(), Failure> {
     let mut topic = Topic::new(arguments.topic.clone()).latched(1);
     if let Some(rate) = arguments.rate {
         topic = topic.rate(rate);
@@ -144,7 +135,7 @@ async fn publish(agent: &Agent, arguments: Arguments, stop: &mut Stop) -> Result
     };
     let mut tally = Tally::default();
     let ended = tokio::select! {
-        ended = publish_all(&publisher, &mut values, &arguments, &mut tally) => ended,
+        ended = publish_all(&publisher, &mut values, arguments, &mut tally) => ended,
         () = stop.requested() => Ok(()),
         () = options::after(arguments.time) => Ok(()),
     };
@@ -164,11 +155,16 @@ async fn publish_all(
         ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
         ticks
     });
-    let has_rate = ticks.is_some();
     let mut results = JoinSet::new();
-    let mut published = 0;
+    let mut is_input_over = false;
     loop {
-        let is_last = arguments.count.is_some_and(|count| published >= count);
+        let published = tally.published;
+        let is_over = is_input_over || arguments.count.is_some_and(|count| published >= count);
+        if is_over && results.is_empty() {
+            return Ok(());
+        }
+        // A value without a rate stays, for subscribers to come.
+        let has_next = ticks.is_some() || published == 0 || values.is_input();
         tokio::select! {
             biased;
             Some(result) = results.join_next() => {
@@ -176,26 +172,17 @@ async fn publish_all(
                     tally.add(number, results, arguments.json)?;
                 }
             }
-            // A value without a rate stays, for subscribers to come.
-            value = due(&mut ticks, values), if !is_last && (has_rate || published == 0 || values.is_input()) => {
-                let Some(value) = value? else {
-                    break;
-                };
-                let publication = publisher.publish(value).await;
-                published += 1;
-                tally.published = published;
-                results.spawn(settled(publication));
-            }
-            () = std::future::pending(), if !is_last => {}
-            else => break,
+            value = due(&mut ticks, values), if has_next && !is_over => match value? {
+                Some(value) => {
+                    let publication = publisher.publish(value).await;
+                    tally.published += 1;
+                    results.spawn(settled(publication));
+                }
+                None => is_input_over = true,
+            },
+            else => std::future::pending().await,
         }
     }
-    while let Some(result) = results.join_next().await {
-        if let Ok((number, results)) = result {
-            tally.add(number, results, arguments.json)?;
-        }
-    }
-    Ok(())
 }
 
 async fn settled(publication: Publication) -> (u64, Vec<Notified>) {
@@ -204,9 +191,7 @@ async fn settled(publication: Publication) -> (u64, Vec<Notified>) {
 
 /// Waits for the next value and the time at which it is due. Dropping the future loses no value.
 async fn due(ticks: &mut Option<Interval>, values: &mut Values) -> Result<Option<Bytes>, Failure> {
-    if let Some(ticks) = ticks {
-        ticks.tick().await;
-    }
+    repeat::tick(ticks).await;
     values.next().await
 }
 

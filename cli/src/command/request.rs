@@ -87,19 +87,8 @@ impl Opening {
         conversation: impl AsyncFnOnce(&Agent, &mut Stop) -> Result<(), Failure>,
     ) -> Result<(), Failure> {
         let config = global.config()?;
-        options::block_on(async {
-            let mut stop = Stop::listen()?;
-            let domain = membership::join(&config).await?;
-            let agent = self.register(&domain, command, &config).await;
-            let done = match &agent {
-                Ok(agent) => conversation(agent, &mut stop).await,
-                Err(_) => Ok(()),
-            };
-            Stop::ending();
-            let registered = agent.map(drop);
-            domain.close().await;
-            registered.and(done)
-        })?
+        let register = async |domain: &fipa::Domain| self.register(domain, command, &config).await;
+        membership::run_agent(&config, register, conversation)
     }
 
     /// Registers the asking agent.

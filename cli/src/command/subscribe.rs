@@ -42,7 +42,7 @@ pub(crate) struct Arguments {
     /// Content of the subscription: for an agent of this project, the topic of the publisher
     content: String,
 
-    /// What to get if this command is slower than the publisher: all, latest(N), or auto, which is the newest one of
+    /// Notifications to get if this command is slower than the publisher: all, latest(N), or auto, which is the newest one of
     /// a stream and all of others
     #[arg(long, value_name = "KEEP", default_value = "auto")]
     keep: Keep,

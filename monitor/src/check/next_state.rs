@@ -165,7 +165,7 @@ fn after_common_step(
                 _ => taken,
             }
         }
-        // What was taken for the failure of a cancel was a failure of the protocol.
+        // The message that counted as the failure of a cancel was a failure of the protocol.
         own if party.echo
             && message.side != party.canceling_side
             && is_told_apart(party, message)

@@ -43,25 +43,18 @@ impl Mts {
     /// Allocates memory for content that several letters will have, to be filled in place: shared memory that all
     /// processes of this host can read if there is some, otherwise heap memory.
     pub fn loan_shared(&self, len: usize) -> Box<dyn LoanedContent> {
-        self.loan_from_shm(len)
-            .unwrap_or_else(|| Box::new(OnTheHeap(vec![0; len])))
+        let mut kinds = self.shared.transports.iter().map(|it| it.kind());
+        let loaned = kinds.find_map(|kind| {
+            self.shared
+                .loan_from(kind, |transport| transport.loan_for_many(len))
+        });
+        loaned.unwrap_or_else(|| Box::new(OnTheHeap(vec![0; len])))
     }
 
     /// Copies content that several letters will have to memory that all processes of this host can read, if a
     /// transport would otherwise copy it for each letter and there is such memory.
     pub fn shared_content(&self, content: &Bytes) -> Option<Bytes> {
         self.shared.shared_content(content)
-    }
-
-    fn loan_from_shm(&self, len: usize) -> Loaned {
-        let mut transports = self.shared.transports.iter();
-        transports.find_map(|transport| match transport.loan_for_many(len) {
-            Ok(loaned) => loaned,
-            Err(error) => {
-                tracing::debug!(%error, kind = %transport.kind(), "cannot loan memory of the transport");
-                None
-            }
-        })
     }
 
     /// Returns the first route of a letter to the only receiver.

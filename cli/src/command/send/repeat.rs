@@ -117,7 +117,7 @@ async fn send_all(
     }
 }
 
-async fn tick(starts: &mut Option<Interval>) {
+pub(in crate::command) async fn tick(starts: &mut Option<Interval>) {
     if let Some(starts) = starts {
         starts.tick().await;
     }
