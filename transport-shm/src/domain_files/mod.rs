@@ -317,6 +317,9 @@ impl DomainFiles {
             Err(error) if error.is_missing_file() => return Ok(cleaned),
             lock => lock?,
         };
+        if self.has_successor() {
+            return Ok(cleaned);
+        }
         let all = self.all()?.into_iter();
         let (alive, gone): (Vec<_>, Vec<_>) = all.partition(|one| self.paths.is_alive(*one));
         self.paths
@@ -378,6 +381,18 @@ impl DomainFiles {
             self.ring_all()?;
         }
         Ok(cleaned)
+    }
+
+    /// Whether the last process of this domain has ended, and another one has started the domain again with a secret
+    /// of its own. The files that exist then belong to processes that this value does not know. The caller must hold
+    /// the lock.
+    fn has_successor(&self) -> bool {
+        match Secret::read(&self.config.root) {
+            Ok(None) => false,
+            Ok(stored) => stored != self.secret,
+            // Files that cannot be examined are not removed.
+            Err(_) => true,
+        }
     }
 
     fn nodes(&self) -> Result<Vec<NodeState<Svc>>, ShmError> {
@@ -538,5 +553,33 @@ pub(crate) fn file_error(
         what,
         path: path.to_owned(),
         source: source.into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::presence::Presence;
+
+    /// A process that ends cleans up last of all, and a tool may have read the directory before.
+    #[test]
+    fn a_late_cleanup_removes_no_file_of_a_domain_that_was_started_again() {
+        let directory = tempfile::tempdir().unwrap();
+        let prefix = format!("fipatest-again-{}", std::process::id());
+        let own = Incarnation::from_u64(7);
+        let config = ShmConfig::new(directory.path().join("shm"), prefix, own);
+        let (left, lock) = DomainFiles::enter(&config).unwrap();
+        drop(lock);
+        assert_eq!(left.clean(true).unwrap().alive, 0);
+        let empty = DomainFiles::of(&config).unwrap();
+        let (started, lock) = DomainFiles::enter(&config).unwrap();
+        let _presence = Presence::create(started.paths().clone(), own).unwrap();
+        drop(lock);
+        for late in [left, empty] {
+            late.clean(true).unwrap();
+            assert!(started.paths().is_alive(own));
+            assert!(PeerProcess::open(started.paths(), own).is_ok());
+            assert_eq!(DomainFiles::of(&config).unwrap().secret, started.secret);
+        }
     }
 }
