@@ -118,6 +118,8 @@ pub mod locks;
 pub mod platform;
 #[cfg(feature = "protocols")]
 pub mod protocol;
+#[cfg(feature = "protocols")]
+pub mod topics;
 
 pub use agent::delivery::{Deliveries, Delivery};
 pub use agent::incoming::Incoming;

@@ -11,7 +11,8 @@ mod support;
 use std::time::Duration;
 
 use fipa::error::SendError;
-use fipa::protocol::{DialogueError, Reply, Task, Topic};
+use fipa::protocol::{DialogueError, Reply, Task};
+use fipa::topics::Topic;
 use fipa::{Agent, AgentId, Config, Domain, Performative};
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;

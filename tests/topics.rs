@@ -11,7 +11,8 @@ use std::process::{Child, ChildStdout, Stdio};
 use std::time::Duration;
 
 use fipa::blocking::Wait;
-use fipa::protocol::{DialogueError, Keep, Notification, NotificationResult, Publisher, Topic};
+use fipa::protocol::{DialogueError, Keep, Notification};
+use fipa::topics::{NotificationResult, Publisher, Topic};
 use fipa::{Agent, Config, Domain, Performative};
 use fipa_testbed::{ignored_test, send_signal, until_async};
 use support::{config, load, mark};
@@ -122,7 +123,7 @@ fn inside_viewer() {
 }
 
 /// Publishes an image that is filled with the low byte of its number.
-async fn publish_image(camera: &Publisher, number: u64) -> fipa::protocol::Publication {
+async fn publish_image(camera: &Publisher, number: u64) -> fipa::topics::Publication {
     let mut loan = camera.loan(IMAGE).unwrap();
     loan.content_mut().fill(number.to_le_bytes()[0]);
     let published = camera.publish_loan(loan).await;

@@ -123,7 +123,7 @@ pub enum DialogueError {
 }
 
 /// A received message and its meaning for the conversation.
-pub(super) struct Interpreted {
+pub(crate) struct Interpreted {
     pub(super) message: Message,
     pub(super) meaning: Meaning,
 }
@@ -154,7 +154,7 @@ pub(super) enum DialogueState {
 }
 
 /// A conversation. After dropping it, its further messages go to [`Agent::receive`](crate::Agent::receive).
-pub(super) struct Dialogue {
+pub(crate) struct Dialogue {
     speaker: Speaker,
     key: ReaderKey,
     partners: PartnerWatch,
@@ -164,7 +164,7 @@ pub(super) struct Dialogue {
 }
 
 /// The sending side of a conversation, and its state.
-pub(super) struct Speaker {
+pub(crate) struct Speaker {
     core: Arc<AgentCore>,
     protocol: String,
     id: String,
@@ -206,7 +206,7 @@ impl Dialogue {
     }
 
     /// Takes part in the conversation that a message has begun.
-    pub(super) fn join(core: &Arc<AgentCore>, incoming: &Incoming) -> Result<Self, DialogueError> {
+    pub(crate) fn join(core: &Arc<AgentCore>, incoming: &Incoming) -> Result<Self, DialogueError> {
         let first = incoming.message();
         let id = first.conversation_id();
         let id = id.ok_or(DialogueError::Unchecked(Unchecked::NoConversation))?;
@@ -317,7 +317,7 @@ impl Dialogue {
     }
 
     /// Ends the conversation, except for one last message.
-    pub(super) fn take_speaker(&mut self) -> Speaker {
+    pub(crate) fn take_speaker(&mut self) -> Speaker {
         let core = Arc::clone(self.agent());
         let ended = Speaker::new(&core, "", String::new());
         std::mem::replace(&mut self.speaker, ended)
@@ -339,7 +339,7 @@ impl Dialogue {
     }
 
     /// Sends a message like [`send`](Self::send), without waiting for the outcomes.
-    pub(super) fn post(
+    pub(crate) fn post(
         &mut self,
         message: MessageBuilder,
         due: Option<Instant>,
@@ -358,7 +358,7 @@ impl Dialogue {
     }
 
     /// Sends a message like [`post`](Self::post), and waits for the outcome.
-    pub(super) async fn say(
+    pub(crate) async fn say(
         &mut self,
         message: MessageBuilder,
         due: Option<Instant>,
@@ -368,7 +368,7 @@ impl Dialogue {
     }
 
     /// Sends a message like [`post`](Self::post), with this deadline instead of that of the configuration.
-    pub(super) fn post_until(
+    pub(crate) fn post_until(
         &mut self,
         message: MessageBuilder,
         deadline: Duration,
@@ -377,12 +377,12 @@ impl Dialogue {
     }
 
     /// Applies the outcomes of the last message.
-    pub(super) fn settle(&mut self, deliveries: &Deliveries) {
+    pub(crate) fn settle(&mut self, deliveries: &Deliveries) {
         self.speaker.settle(deliveries);
     }
 
     /// Answers a message of this conversation, and waits for the outcome.
-    pub(super) async fn answer(
+    pub(crate) async fn answer(
         &mut self,
         to: &Message,
         act: Performative,
@@ -421,7 +421,7 @@ impl Dialogue {
     /// Waits for the next message until `due`. A message that violates the protocol is an error, and so
     /// are not-understood, cancel and the report of an undelivered message. An agent that is gone is an
     /// error once, and on every call if no agent is left.
-    pub(super) async fn receive(
+    pub(crate) async fn receive(
         &mut self,
         due: Option<Instant>,
     ) -> Result<Interpreted, DialogueError> {
@@ -566,7 +566,7 @@ impl Dialogue {
     }
 
     /// Returns the agent whose side of the conversation this is.
-    pub(super) fn agent(&self) -> &Arc<AgentCore> {
+    pub(crate) fn agent(&self) -> &Arc<AgentCore> {
         &self.speaker.core
     }
 
@@ -694,7 +694,7 @@ impl Speaker {
 
     /// Ends the conversation for this participant, unless it is over: with `failure`, or with
     /// `not-understood` if no message was sent or the protocol does not allow `failure`.
-    pub(super) fn abandon(&mut self, last: &Message, reason: &str) {
+    pub(crate) fn abandon(&mut self, last: &Message, reason: &str) {
         if self.over || !self.core.endpoint.domain.inner.owner.is_this() {
             return;
         }
@@ -809,7 +809,7 @@ impl CheckFailure {
 
 /// Waits for the outcomes of these messages, at most until `due`. The outcomes are ignored: an agent
 /// that has ended needs no rejection.
-pub(super) async fn settle(sent: impl IntoIterator<Item = Sent>, due: Option<Instant>) {
+pub(crate) async fn settle(sent: impl IntoIterator<Item = Sent>, due: Option<Instant>) {
     for sending in sent {
         let settled = deliveries(sending);
         match due {
@@ -850,7 +850,7 @@ pub(super) fn lost_by(report: &Message) -> String {
 }
 
 /// Returns the name of the sender.
-pub(super) fn name_of(message: &Message) -> String {
+pub(crate) fn name_of(message: &Message) -> String {
     let sender = message.sender();
     sender.map_or_else(String::new, |sender| sender.name().to_owned())
 }

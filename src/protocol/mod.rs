@@ -3,8 +3,8 @@
 //! An initiator calls [`Agent::request`], [`Agent::query`], [`Agent::subscribe`] or [`Agent::contract_net`],
 //! or one of the [`Protocols`] that few programs lead, and gets the result of the protocol. A participant
 //! passes a received opening message to [`Agent::take_part`], agrees, works and replies;
-//! [`Agent::serve`] runs a handler for each opening message, and [`Agent::publisher`] notifies all
-//! subscribers to a topic. Messages of other conversations still go to [`Agent::receive`].
+//! [`Agent::serve`] runs a handler for each opening message. [`topics`](crate::topics) has the participant of
+//! subscriptions. Messages of other conversations still go to [`Agent::receive`].
 //!
 //! # Partners that are gone or unreachable
 //!
@@ -36,28 +36,26 @@
 //!   shell around it; `reachability.rs` reports it. `receivers.rs` expands patterns and coalitions.
 //! * `protocols.rs` is the view of the rarer calls. `initiator.rs`, `subscription.rs`, `contract_net.rs`, `auction.rs` and `proxied.rs` are the sides
 //!   of initiators; `bids.rs` collects the answers to a call for proposals. `participant.rs` is the
-//!   side of participants; `serving.rs` and `publisher.rs` lead many of them. `topic.rs` has what publishers and
-//!   subscribers say to each other.
+//!   side of participants; `serving.rs` leads many of them. `keep.rs` has the words of subscribers and publishers.
 //!
 //! Not in this module: the rules of the protocols (`fipa-monitor`).
 
 mod auction;
 mod bids;
 mod contract_net;
-mod dialogue;
+pub(crate) mod dialogue;
 mod history;
 mod initiator;
+pub(crate) mod keep;
 mod participant;
 mod partners;
 pub(crate) mod peer_shares;
 mod protocols;
 mod proxied;
-mod publisher;
 mod reachability;
 mod receivers;
-mod serving;
+pub(crate) mod serving;
 mod subscription;
-mod topic;
 mod watching;
 
 pub use auction::Auction;
@@ -66,17 +64,16 @@ pub use contract_net::{Awarded, ContractNet};
 pub use dialogue::DialogueError;
 pub use history::Departure;
 pub use initiator::{Decision, Request};
+pub use keep::{Keep, KeepError};
 pub use participant::{Reply, Task};
 pub use partners::PartnerEvent;
 pub use protocols::Protocols;
 pub use proxied::Proxied;
-pub use publisher::{NotificationResult, Notified, Publication, Publisher, TopicLoan};
 pub use reachability::{Reachability, Unreachable};
 pub use serving::Server;
 #[cfg(feature = "actions")]
 pub(crate) use serving::serve_those;
 pub use subscription::{Notification, Subscription};
-pub use topic::{Keep, KeepError, Topic};
 pub use watching::PartnerWatch;
 
 #[cfg(doc)]

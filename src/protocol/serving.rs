@@ -110,13 +110,13 @@ impl Drop for Server {
 }
 
 /// The messages that begin a conversation of one protocol. Dropping it ends the server.
-pub(super) struct ServedQueue {
+pub(crate) struct ServedQueue {
     core: Arc<AgentCore>,
     key: ReaderKey,
 }
 
 impl ServedQueue {
-    pub(super) fn new(core: &Arc<AgentCore>, opens: Opens) -> Self {
+    pub(crate) fn new(core: &Arc<AgentCore>, opens: Opens) -> Self {
         Self {
             key: core.demultiplexer.serve(opens),
             core: Arc::clone(core),
@@ -124,19 +124,19 @@ impl ServedQueue {
     }
 
     /// Starts a queue for the messages that no other server handles.
-    pub(super) fn last(core: &Arc<AgentCore>, opens: Opens) -> Self {
+    pub(crate) fn last(core: &Arc<AgentCore>, opens: Opens) -> Self {
         Self {
             key: core.demultiplexer.serve_last(opens),
             core: Arc::clone(core),
         }
     }
 
-    pub(super) fn agent(&self) -> &Arc<AgentCore> {
+    pub(crate) fn agent(&self) -> &Arc<AgentCore> {
         &self.core
     }
 
     /// Waits for the next message. Returns `None` if the agent receives no further messages.
-    pub(super) async fn next(&self) -> Option<Incoming> {
+    pub(crate) async fn next(&self) -> Option<Incoming> {
         let endpoint = &self.core.endpoint;
         let next = self.core.demultiplexer.next_served(endpoint, &self.key);
         next.await.ok()
@@ -150,7 +150,7 @@ impl Drop for ServedQueue {
 }
 
 /// Decides whether a message begins a conversation of this protocol, for a server.
-pub(super) fn opening(
+pub(crate) fn opening(
     core: &AgentCore,
     protocol: &str,
     also: impl Fn(&Message) -> bool + Send + Sync + 'static,
@@ -201,7 +201,7 @@ where
 }
 
 /// Refuses a conversation that this message begins.
-pub(super) fn refuse(core: &Arc<AgentCore>, first: &Incoming, reason: &str) {
+pub(crate) fn refuse(core: &Arc<AgentCore>, first: &Incoming, reason: &str) {
     let home: Home = Arc::new(Mutex::new(None));
     match Task::join(core, first, Some(Arc::clone(&home))) {
         Ok(task) => drop(task),

@@ -20,9 +20,9 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::dialogue::{Dialogue, DialogueError, after, only_delivered};
+use super::keep::{self, Keep};
 use super::reachability::Reachability;
 use super::receivers::single;
-use super::topic::{self, Keep};
 use crate::agent::{Agent, AgentCore};
 
 /// Maximum number of notifications that are read before the program asks for them, of a subscription to all.
@@ -42,7 +42,7 @@ impl Agent {
     /// Subscribes to the notifications of an agent (`subscribe`, FIPA00035). Waits until the agent
     /// agrees or sends the first notification.
     ///
-    /// If the agent publishes the topic with a [`Publisher`](super::Publisher), the subscriber gets the newest
+    /// If the agent publishes the topic with a [`Publisher`](crate::topics::Publisher), the subscriber gets the newest
     /// notification of a stream and all of others ([`Keep::Auto`]); [`subscribe_keeping`](Self::subscribe_keeping) asks
     /// for something else.
     ///
@@ -86,7 +86,7 @@ impl Agent {
         subscribe: MessageBuilder,
         timeout: Duration,
     ) -> Result<Subscription, DialogueError> {
-        let subscribe = subscribe.user_defined(topic::DELIVERY, keep.to_string());
+        let subscribe = subscribe.user_defined(keep::DELIVERY, keep.to_string());
         Subscription::begin(&self.core, subscribe, timeout).await
     }
 }
@@ -128,14 +128,14 @@ impl Notification {
     /// Returns its number in the topic. `None` if the publisher does not number its notifications.
     #[must_use]
     pub fn number(&self) -> Option<u64> {
-        topic::number_of(&self.message)
+        keep::number_of(&self.message)
     }
 
     /// Returns the time since the publication, by the clocks of both hosts. `None` if the publisher does not say when
     /// it was.
     #[must_use]
     pub fn age(&self) -> Option<Duration> {
-        let published = topic::published_at(&self.message)?;
+        let published = keep::published_at(&self.message)?;
         Some(
             SystemTime::now()
                 .duration_since(published)
@@ -481,14 +481,14 @@ impl Subscription {
             }
         };
         let mut missed = 0;
-        if let Some(number) = topic::number_of(&message) {
+        if let Some(number) = keep::number_of(&message) {
             if restarted {
                 self.last.clear();
             }
             if let Some((last, _)) = self.last.back() {
                 missed = number.saturating_sub(*last).saturating_sub(1);
             }
-            let published = topic::published_at(&message).unwrap_or_else(SystemTime::now);
+            let published = keep::published_at(&message).unwrap_or_else(SystemTime::now);
             self.last.push_back((number, published));
             while self.last.len() > RATED {
                 self.last.pop_front();

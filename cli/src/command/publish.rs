@@ -7,7 +7,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use clap::Args;
 use fipa::error::ErrorChain;
-use fipa::protocol::{NotificationResult, Notified, Publication, Publisher, Topic};
+use fipa::topics::{NotificationResult, Notified, Publication, Publisher, Topic};
 use fipa::{Agent, AgentId, Domain, Message, RegisterOptions};
 use fipa_acl::{escape, escape_name};
 use serde_json::json;

@@ -1,14 +1,14 @@
-//! Topics: what a publisher declares, what a subscriber asks for, and the parameters that carry it.
+//! What a subscriber to a topic asks for, and the parameters of the messages that carry it.
 
 use std::fmt;
 use std::num::NonZeroU32;
 use std::str::FromStr;
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use fipa_acl::{Message, MessageBuilder, Time};
 
 /// User-defined parameter of a `subscribe` and its `agree`, and of the notifications of a stream: a [`Keep`].
-pub(super) const DELIVERY: &str = "X-delivery";
+pub(crate) const DELIVERY: &str = "X-delivery";
 
 /// User-defined parameter of a notification: its number, decimal.
 pub(super) const SAMPLE: &str = "X-sample";
@@ -17,7 +17,7 @@ pub(super) const SAMPLE: &str = "X-sample";
 pub(super) const PUBLISHED: &str = "X-published";
 
 /// Maximum number of notifications of which a publisher keeps the newest for one subscriber.
-pub(super) const MAX_KEPT: u32 = 64;
+pub(crate) const MAX_KEPT: u32 = 64;
 
 /// The notifications that a subscriber gets if it is slower than the publisher.
 ///
@@ -26,11 +26,11 @@ pub(super) const MAX_KEPT: u32 = 64;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[non_exhaustive]
 pub enum Keep {
-    /// The newest one of a stream, which is a topic with a [rate](Topic::rate) or with loaned contents; all of others.
+    /// The newest one of a stream, which is a topic with a [rate](crate::topics::Topic::rate) or with loaned contents; all of others.
     #[default]
     Auto,
     /// Each one. A subscriber that does not receive them slows the publisher down, for at most
-    /// [`Topic::wait_for_slow`] per notification.
+    /// [`Topic::wait_for_slow`](crate::topics::Topic::wait_for_slow) per notification.
     All,
     /// The newest `n`, at most 64. An older one that has not left is replaced by a newer one, which the subscriber sees
     /// as a [gap](super::Notification::missed).
@@ -48,7 +48,7 @@ impl Keep {
     }
 
     /// Returns the number of notifications that are kept for a topic; `None` for all of them.
-    pub(super) fn bound(self, is_stream: bool) -> Option<usize> {
+    pub(crate) fn bound(self, is_stream: bool) -> Option<usize> {
         match self {
             Self::All => None,
             Self::Auto => is_stream.then_some(1),
@@ -57,7 +57,7 @@ impl Keep {
     }
 
     /// Reads the parameter of a message.
-    pub(super) fn of(message: &Message) -> Option<Self> {
+    pub(crate) fn of(message: &Message) -> Option<Self> {
         value(message, DELIVERY)?.parse().ok()
     }
 }
@@ -96,83 +96,8 @@ impl FromStr for Keep {
     }
 }
 
-/// A topic of a publisher: its name, which is the content of a `subscribe`, and what is known about its values.
-///
-/// ```
-/// use fipa::protocol::Topic;
-///
-/// let camera = Topic::new("camera").rate(30.0).latched(1);
-/// assert_eq!(camera.name(), "camera");
-/// ```
-#[derive(Debug, Clone, PartialEq)]
-pub struct Topic {
-    name: String,
-    /// Notifications per second, if they are known.
-    pub(super) rate: Option<f64>,
-    /// Number of contents that are kept for new subscribers.
-    pub(super) latched: usize,
-    /// Time for which a publication waits for a slow subscriber.
-    pub(super) wait: Duration,
-}
-
-/// Time for which a publisher waits for a slow subscriber by default.
-const WAIT: Duration = Duration::from_secs(5);
-
-impl Topic {
-    /// Creates a topic of which nothing but the name is known.
-    pub fn new(name: impl Into<String>) -> Self {
-        Self {
-            name: name.into(),
-            rate: None,
-            latched: 0,
-            wait: WAIT,
-        }
-    }
-
-    /// Sets the number of notifications per second. The topic is then a stream: subscribers get the newest
-    /// notification unless they ask for others ([`Keep::Auto`]).
-    #[must_use]
-    pub fn rate(mut self, hertz: f64) -> Self {
-        self.rate = Some(hertz);
-        self
-    }
-
-    /// Keeps the newest `n` contents, at most 64, for new subscribers, which get them at once. 0 by default.
-    #[must_use]
-    pub fn latched(mut self, n: usize) -> Self {
-        self.latched = n.min(MAX_KEPT as usize);
-        self
-    }
-
-    /// Sets the time for which one call of [`Publisher::publish`](super::Publisher::publish) waits at most for a
-    /// subscriber that asks for [all](Keep::All) notifications and has 64 that wait. 5 s by default.
-    #[must_use]
-    pub fn wait_for_slow(mut self, wait: Duration) -> Self {
-        self.wait = wait;
-        self
-    }
-
-    /// Returns the name.
-    #[must_use]
-    pub fn name(&self) -> &str {
-        &self.name
-    }
-}
-
-impl From<&str> for Topic {
-    fn from(name: &str) -> Self {
-        Self::new(name)
-    }
-}
-
-impl From<String> for Topic {
-    fn from(name: String) -> Self {
-        Self::new(name)
-    }
-}
-
 /// Adds the parameters of a notification.
-pub(super) fn marked(
+pub(crate) fn marked(
     message: MessageBuilder,
     number: u64,
     published: SystemTime,

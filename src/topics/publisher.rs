@@ -18,14 +18,16 @@ use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
-use super::dialogue::{Dialogue, DialogueError, name_of};
-use super::serving::{ServedQueue, opening, refuse};
-use super::topic::{self, Keep, Topic};
+use super::topic::Topic;
 use crate::agent::delivery::{Deliveries, deliveries};
 use crate::agent::incoming::Incoming;
 use crate::agent::{Agent, AgentCore};
 use crate::error::SendError;
+use crate::protocol::dialogue::{Dialogue, name_of};
+use crate::protocol::keep::{DELIVERY, marked};
 use crate::protocol::peer_shares::PeerPlaces;
+use crate::protocol::serving::{ServedQueue, opening, refuse};
+use crate::protocol::{DialogueError, Keep};
 
 /// Maximum number of notifications that wait for one subscriber to all of them. Beyond it, `publish` waits.
 const MAX_WAITING: usize = 64;
@@ -500,7 +502,7 @@ async fn serve(
     let agree = core.endpoint.reply(first, Performative::Agree).content("");
     let agree = match asked {
         // Shows a partner that its wish is known.
-        Some(keep) => agree.user_defined(topic::DELIVERY, keep.to_string()),
+        Some(keep) => agree.user_defined(DELIVERY, keep.to_string()),
         None => agree,
     };
     let served = match dialogue.say(agree, None).await {
@@ -610,7 +612,7 @@ fn send(
     let Waiting { sample, result } = waiting;
     let notification = dialogue.agent().endpoint.reply(first, Performative::Inform);
     let notification = notification.content(sample.content);
-    let notification = topic::marked(notification, sample.number, sample.published, keep);
+    let notification = marked(notification, sample.number, sample.published, keep);
     // With a short deadline, each end of it would leave one more outdated content in the queue of a subscriber that
     // is stopped.
     let sent = match keep {
