@@ -9,8 +9,10 @@ mod support;
 use std::time::{Duration, SystemTime};
 
 use fipa::platform::{
-    AgentDescription, AmsDescription, Df, Exception, PlatformError, ServiceDescription, limits,
+    AgentDescription, AmsDescription, Df, Exception, PlatformError, Property, ServiceDescription,
+    limits,
 };
+use fipa::topics::Topic;
 use fipa::{AgentId, Config, Domain, Gateway, Kind, Message, Performative, Reach, Time};
 use fipa_sds::{Directory as _, EXCHANGE_ONTOLOGY, MdnsConfig, MdnsDirectory, MtsId, Registration};
 use fipa_testbed::until_async;
@@ -652,4 +654,122 @@ async fn the_configuration_names_the_agents_and_turns_them_off() {
     drop(rover);
     domain.close().await;
     gateway.close().await;
+}
+
+/// Searches until the names of the services that match are these.
+async fn until_listed(df: &Df<'_>, template: &AgentDescription, names: &[&str]) {
+    let listed = async || {
+        let found = df.search(template).await.unwrap();
+        let services = found.iter().flat_map(|it| &it.services);
+        let mut found: Vec<String> = services.filter_map(|it| it.name.clone()).collect();
+        found.sort_unstable();
+        found
+    };
+    let until = tokio::time::Instant::now() + TIMEOUT;
+    loop {
+        let found = listed().await;
+        if found == names {
+            return;
+        }
+        assert!(tokio::time::Instant::now() < until, "{found:?}");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+/// The application describes its agent while topics come and go.
+#[tokio::test(flavor = "multi_thread")]
+async fn topics_are_listed_beside_the_services_of_the_application() {
+    let [(_gateway, near), (_far_gateway, far)] = two_hosts(&[]).await;
+    let camera = near.register("camera").await.unwrap();
+    let viewer = far.register("viewer").await.unwrap();
+    let image = Topic::new("image").media_type("image/jpeg").rate(30.0);
+    let image = camera.publisher(image).unwrap();
+    let own = AgentDescription {
+        name: Some(camera.id().clone()),
+        ..AgentDescription::default()
+    };
+    let df = camera.df().unwrap();
+    until_listed(&df, &own, &["image"]).await;
+    df.register(lifting_as("lift-1")).await.unwrap();
+    until_listed(&df, &own, &["image", "lift-1"]).await;
+    let charge = camera.publisher("charge").unwrap();
+    until_listed(&df, &own, &["charge", "image", "lift-1"]).await;
+    df.modify(lifting_as("lift-2")).await.unwrap();
+    until_listed(&df, &own, &["charge", "image", "lift-2"]).await;
+
+    knows(&far, "camera").await;
+    let images = AgentDescription {
+        services: vec![ServiceDescription {
+            properties: vec![Property::new("media-type", "image/jpeg")],
+            ..ServiceDescription::of_type("topic")
+        }],
+        ..AgentDescription::default()
+    };
+    until_listed(
+        &viewer.df().unwrap(),
+        &images,
+        &["charge", "image", "lift-2"],
+    )
+    .await;
+
+    df.deregister().await.unwrap();
+    until_listed(&df, &own, &["charge", "image"]).await;
+    drop(charge);
+    until_listed(&df, &own, &["image"]).await;
+    drop(image);
+    until_listed(&df, &own, &[]).await;
+    assert!(df.search(&own).await.unwrap().is_empty());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn topics_are_listed_by_the_next_gateway() {
+    let config = config(&[]);
+    let (gateway, domain) = host(&config).await;
+    let camera = domain.register("camera").await.unwrap();
+    let viewer = domain.register("viewer").await.unwrap();
+    let _image = camera.publisher("image").unwrap();
+    let topics = AgentDescription {
+        services: vec![ServiceDescription::of_type("topic")],
+        ..AgentDescription::default()
+    };
+    until_listed(&viewer.df().unwrap(), &topics, &["image"]).await;
+    gateway.close().await;
+    until_async("the directory facilitator ends", || viewer.df().is_err()).await;
+    let _next = Gateway::open(&self::config(&[&format!("domain={}", config.domain)])).await;
+    until_async("a directory facilitator", || viewer.df().is_ok()).await;
+    until_listed(&viewer.df().unwrap(), &topics, &["image"]).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_of_another_host_tells_its_topics() {
+    let [(_gateway, near), (_far_gateway, far)] = two_hosts(&[]).await;
+    let camera = near.register("camera").await.unwrap();
+    let viewer = far.register("viewer").await.unwrap();
+    knows(&far, "camera").await;
+    knows(&near, "viewer").await;
+    let image = camera.publisher(Topic::new("image").rate(30.0)).unwrap();
+    let _charge = camera.publisher("charge").unwrap();
+    let subscribe = viewer.message(Performative::Subscribe).receiver("camera");
+    let mut images = viewer
+        .subscribe(subscribe.content("image"), TIMEOUT)
+        .await
+        .unwrap();
+    for _ in 0..2 {
+        assert_eq!(image.publish(vec![7; 1000]).await.delivered().await, 1);
+        images.next().await.unwrap();
+    }
+    let topics = viewer.topics_of(camera.id()).await.unwrap();
+    let names: Vec<&str> = topics.iter().map(|it| &*it.name).collect();
+    assert_eq!(names, ["charge", "image"]);
+    assert_eq!((topics[0].published, topics[0].bytes), (0, None));
+    let image = &topics[1];
+    assert_eq!((image.published, image.bytes), (2, Some(1000)));
+    assert_eq!((image.rate, image.subscribers), (Some(30.0), 1));
+    assert!(image.measured_rate.is_some());
+    let subscriber = &image.first_subscribers[0];
+    assert_eq!(
+        (&*subscriber.name, &*subscriber.keep),
+        ("viewer", "latest(1)")
+    );
+    assert_eq!((subscriber.delivered, subscriber.failed), (2, 0));
 }

@@ -47,6 +47,15 @@ pub struct RemoteEntry {
     pub has_lease: bool,
 }
 
+impl AgentDescription {
+    /// Whether the directory facilitators of other hosts list the description: its scope includes them, and it has at
+    /// most [`limits::REMOTE_BYTES`] and [`limits::REMOTE_PARTS`].
+    #[must_use]
+    pub fn travels(&self) -> bool {
+        is_global(self) && text(self).is_some()
+    }
+}
+
 /// Whether the scope of a description includes other hosts. The value `global` of FIPA00023 is the
 /// default.
 pub(crate) fn is_global(description: &AgentDescription) -> bool {

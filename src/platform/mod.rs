@@ -39,7 +39,7 @@ mod notifications;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
+use fipa_acl::{AgentId, Message, MessageBuilder, Performative, Time};
 use fipa_content::PrintError;
 pub use fipa_platform::{
     AgentDescription, AgentState, AmsDescription, AnswerError, ApDescription, Constraints,
@@ -47,6 +47,7 @@ pub use fipa_platform::{
 };
 use fipa_platform::{Function, found, registered, subscription};
 use fipa_sds::{Entry, Reach};
+use fipa_transport::Incarnation;
 
 pub use self::notifications::Notifications;
 use crate::agent::{Agent, AgentCore};
@@ -129,18 +130,76 @@ impl Agent {
     }
 
     fn platform_agent(&self, agent_type: &str) -> Option<AgentId> {
-        let directory = self.domain().directory();
-        directory.refresh();
-        let entries = directory.entries();
-        let here = entries.iter().filter(|entry| {
-            entry.reach == Reach::Local
-                && entry.is_platform_agent()
-                && entry.agent_type == agent_type
-        });
-        // The agent may have a second name for other hosts, which is longer.
-        let own = here.min_by_key(|entry| entry.name.len());
-        AgentId::new(&*own?.name).ok()
+        platform_agent(&self.core, agent_type).map(|(id, _)| id)
     }
+}
+
+/// Returns the directory facilitator of the host of an agent, and its registration.
+pub(crate) fn local_facilitator(agent: &AgentCore) -> Option<(AgentId, Incarnation)> {
+    platform_agent(agent, Entry::DF_TYPE)
+}
+
+fn platform_agent(agent: &AgentCore, agent_type: &str) -> Option<(AgentId, Incarnation)> {
+    let directory = agent.endpoint.domain.directory();
+    directory.refresh();
+    let entries = directory.entries();
+    let here = entries.iter().filter(|entry| {
+        entry.reach == Reach::Local && entry.is_platform_agent() && entry.agent_type == agent_type
+    });
+    // The agent may have a second name for other hosts, which is longer.
+    let own = here.min_by_key(|entry| entry.name.len())?;
+    Some((AgentId::new(&*own.name).ok()?, own.incarnation))
+}
+
+/// The type of a service that is a topic; see [`topics`](crate::topics).
+pub(crate) const TOPIC: &str = "topic";
+
+fn is_topic(service: &ServiceDescription) -> bool {
+    service.service_type.as_deref() == Some(TOPIC)
+}
+
+/// Whether a description has no other parts than topics.
+fn has_only_topics(description: &AgentDescription) -> bool {
+    description.services.iter().all(is_topic)
+        && description.protocols.is_empty()
+        && description.ontologies.is_empty()
+        && description.languages.is_empty()
+}
+
+/// Adds the topics of the description that an agent has.
+fn with_topics(mut description: AgentDescription, known: AgentDescription) -> AgentDescription {
+    let is_new = |topic: &ServiceDescription| {
+        let mut given = description.services.iter();
+        is_topic(topic) && !given.any(|service| service.name == topic.name)
+    };
+    let topics: Vec<_> = known.services.into_iter().filter(is_new).collect();
+    description.services.extend(topics);
+    description
+}
+
+/// Replaces the topics of an agent in its directory facilitator, as far as the description then still travels to other
+/// hosts. Returns the end of the lease.
+pub(crate) async fn replace_topics(
+    agent: &Arc<AgentCore>,
+    df: AgentId,
+    topics: &[ServiceDescription],
+) -> Result<Option<Time>, PlatformError> {
+    let df = Server {
+        core: Arc::clone(agent),
+        id: df,
+    };
+    let changed = df.change_description(|own| {
+        own.services.retain(|service| !is_topic(service));
+        let travels = own.travels();
+        for topic in topics {
+            own.services.push(topic.clone());
+            if travels && !own.travels() {
+                own.services.pop();
+                break;
+            }
+        }
+    });
+    Ok(changed.await?.lease_time)
 }
 
 /// A directory facilitator.
@@ -163,23 +222,12 @@ impl<'a> Df<'a> {
         &self,
         service: ServiceDescription,
     ) -> Result<AgentDescription, PlatformError> {
-        let own = AgentDescription {
-            name: Some(self.own_name()),
-            ..AgentDescription::default()
-        };
-        if let Some(mut known) = self.search(&own).await?.pop() {
-            known.services.retain(|other| other.name != service.name);
-            known.services.push(service.clone());
-            // The lease begins again.
-            known.lease_time = None;
-            match self.modify(known).await {
-                // That description is in the directory facilitator of another host.
-                Err(PlatformError::Rejected(Exception::NotRegistered)) => {}
-                result => return result,
-            }
-        }
-        let services = vec![service];
-        self.register(AgentDescription { services, ..own }).await
+        let changed = self.0.server();
+        let changed = changed.change_description(|own| {
+            own.services.retain(|other| other.name != service.name);
+            own.services.push(service.clone());
+        });
+        changed.await
     }
 
     /// Registers a description of this agent. Its name, if it is missing, is that of this agent. Returns
@@ -192,32 +240,54 @@ impl<'a> Df<'a> {
         &self,
         description: AgentDescription,
     ) -> Result<AgentDescription, PlatformError> {
-        let description = self.named(description);
-        let answer = self.0.request(&Function::register(&description)).await?;
-        Ok(registered(&answer)?)
+        let (server, description) = (self.0.server(), self.named(description));
+        let _turn = server.core.topics.describing.lock().await;
+        let registered = server.register(&description).await;
+        let already = Exception::AlreadyRegistered;
+        if !matches!(&registered, Err(PlatformError::Rejected(reason)) if *reason == already) {
+            return registered;
+        }
+        // The list of topics may have registered the agent.
+        match server.listed_topics().await? {
+            Some(known) if has_only_topics(&known) => {
+                server.modify(&with_topics(description, known)).await
+            }
+            _ => registered,
+        }
     }
 
-    /// Replaces the description of this agent, and renews its lease.
+    /// Replaces the description of this agent, and renews its lease. The services that are
+    /// [topics](crate::topics) of this agent stay.
     ///
     /// # Errors
-    /// If the agent has no description ([`Exception::NotRegistered`]), or the directory facilitator
-    /// refuses, fails or does not answer.
+    /// If the agent has no description ([`Exception::NotRegistered`]), or the directory
+    /// facilitator refuses, fails or does not answer.
     pub async fn modify(
         &self,
         description: AgentDescription,
     ) -> Result<AgentDescription, PlatformError> {
-        let description = self.named(description);
-        let answer = self.0.request(&Function::modify(&description)).await?;
-        Ok(registered(&answer)?)
+        let (server, mut description) = (self.0.server(), self.named(description));
+        let _turn = server.core.topics.describing.lock().await;
+        if let Some(known) = server.listed_topics().await? {
+            description = with_topics(description, known);
+        }
+        server.modify(&description).await
     }
 
-    /// Removes the description of this agent.
+    /// Removes the description of this agent. The services that are [topics](crate::topics) of this agent stay.
     ///
     /// # Errors
     /// See [`modify`](Self::modify).
     pub async fn deregister(&self) -> Result<(), PlatformError> {
-        let own = self.own_name();
-        self.0.request(&Function::deregister(&own)).await.map(drop)
+        let server = self.0.server();
+        let _turn = server.core.topics.describing.lock().await;
+        match server.listed_topics().await? {
+            Some(known) if !has_only_topics(&known) => {
+                let none = self.named(AgentDescription::default());
+                server.modify(&with_topics(none, known)).await.map(drop)
+            }
+            _ => server.deregister().await,
+        }
     }
 
     /// Returns the descriptions that match a template: each slot of the template has its counterpart in
@@ -241,9 +311,7 @@ impl<'a> Df<'a> {
         template: &AgentDescription,
         constraints: &Constraints,
     ) -> Result<Vec<AgentDescription>, PlatformError> {
-        let search = Function::search(template, constraints);
-        let answer = self.0.request(&search).await?;
-        Ok(found(&answer)?)
+        self.0.server().search(template, constraints).await
     }
 
     /// Subscribes to the descriptions that match a template. The first notification has those that
@@ -258,13 +326,9 @@ impl<'a> Df<'a> {
         Notifications::begin(self.0.server(), template).await
     }
 
-    fn own_name(&self) -> AgentId {
-        self.0.agent.id().clone()
-    }
-
     fn named(&self, description: AgentDescription) -> AgentDescription {
         AgentDescription {
-            name: description.name.or_else(|| Some(self.own_name())),
+            name: description.name.or_else(|| Some(self.0.agent.id().clone())),
             ..description
         }
     }
@@ -392,6 +456,79 @@ impl Server {
         let request = self.message(Performative::Request, "fipa-sl0", content);
         let begun = Request::begin(&self.core, "fipa-request", request, self.timeout());
         Ok(begun.await?.result().await?)
+    }
+
+    async fn register(
+        &self,
+        description: &AgentDescription,
+    ) -> Result<AgentDescription, PlatformError> {
+        let answer = self.request(&Function::register(description)).await?;
+        Ok(registered(&answer)?)
+    }
+
+    async fn modify(
+        &self,
+        description: &AgentDescription,
+    ) -> Result<AgentDescription, PlatformError> {
+        let answer = self.request(&Function::modify(description)).await?;
+        Ok(registered(&answer)?)
+    }
+
+    async fn deregister(&self) -> Result<(), PlatformError> {
+        let function = Function::deregister(&self.core.endpoint.id);
+        self.request(&function).await.map(drop)
+    }
+
+    async fn search(
+        &self,
+        template: &AgentDescription,
+        constraints: &Constraints,
+    ) -> Result<Vec<AgentDescription>, PlatformError> {
+        let answer = self
+            .request(&Function::search(template, constraints))
+            .await?;
+        Ok(found(&answer)?)
+    }
+
+    /// Returns an empty description of this agent.
+    fn own(&self) -> AgentDescription {
+        AgentDescription {
+            name: Some(self.core.endpoint.id.clone()),
+            ..AgentDescription::default()
+        }
+    }
+
+    /// Returns the description of this agent if it publishes topics and has one.
+    async fn listed_topics(&self) -> Result<Option<AgentDescription>, PlatformError> {
+        match self.core.topics.is_empty() {
+            true => Ok(None),
+            false => Ok(self.search(&self.own(), &Constraints::all()).await?.pop()),
+        }
+    }
+
+    /// Changes the description of this agent, which is registered if necessary and deregistered if nothing is left.
+    async fn change_description(
+        &self,
+        change: impl Fn(&mut AgentDescription),
+    ) -> Result<AgentDescription, PlatformError> {
+        let _turn = self.core.topics.describing.lock().await;
+        let mut own = self.own();
+        if let Some(mut known) = self.search(&own, &Constraints::all()).await?.pop() {
+            // The lease begins again.
+            known.lease_time = None;
+            change(&mut known);
+            let changed = match known == own {
+                true => self.deregister().await.map(|()| known),
+                false => self.modify(&known).await,
+            };
+            match changed {
+                // That description is in the directory facilitator of another host.
+                Err(PlatformError::Rejected(Exception::NotRegistered)) => {}
+                changed => return changed,
+            }
+        }
+        change(&mut own);
+        self.register(&own).await
     }
 
     async fn subscribe(&self, template: &AgentDescription) -> Result<Subscription, PlatformError> {

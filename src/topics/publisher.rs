@@ -18,9 +18,13 @@ use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
+use super::listing;
+use super::question::answer_questions;
+use super::rate::MeasuredRate;
 use super::topic::Topic;
 use crate::agent::delivery::{Deliveries, deliveries};
 use crate::agent::incoming::Incoming;
+use crate::agent::topics::{SubscriberStatus, TopicSource, TopicStatus};
 use crate::agent::{Agent, AgentCore};
 use crate::error::SendError;
 use crate::protocol::dialogue::{Dialogue, name_of};
@@ -43,6 +47,9 @@ impl Agent {
     /// A subscriber that cancels, leaves or dies is removed. A subscription to a topic that no publisher of this agent
     /// has is refused, with the topics that exist, unless the agent [serves](Self::serve) `fipa-subscribe`. Other
     /// messages go to [`receive`](Self::receive).
+    ///
+    /// The directory facilitator of the host lists the topic as a service of the type `topic`, with its name, media
+    /// type and rate. The agent answers questions for its topics; see [`topics_of`](Self::topics_of).
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -78,7 +85,10 @@ impl Agent {
         });
         let queue = ServedQueue::new(&self.core, opens);
         let task = runtime.spawn(accept(queue, Arc::clone(&shared)));
-        declare(&self.core, shared.topic.name())?;
+        let source: Weak<dyn TopicSource> = Arc::downgrade(&shared) as _;
+        if self.core.topics.add(shared.topic.name(), source) {
+            start(&self.core)?;
+        }
         Ok(Publisher {
             shared,
             task,
@@ -113,6 +123,9 @@ struct State {
     latched: VecDeque<Sample>,
     /// Whether subscribers get the newest sample by default.
     is_stream: bool,
+    /// Length of the newest sample in bytes.
+    len: Option<u64>,
+    measured_rate: MeasuredRate,
 }
 
 /// A published content.
@@ -128,8 +141,15 @@ struct Subscriber {
     name: String,
     keep: Keep,
     waiting: VecDeque<Waiting>,
+    /// Whether a notification is under way.
+    is_busy: bool,
     /// Notified when a sample is added.
     added: Arc<Notify>,
+    /// Numbers of notifications by their result.
+    delivered: u64,
+    replaced: u64,
+    failed: u64,
+    last_failure: Option<String>,
 }
 
 /// A sample that has not been sent to one subscriber.
@@ -322,7 +342,8 @@ impl fmt::Debug for Publisher {
 impl Drop for Publisher {
     fn drop(&mut self) {
         self.task.abort();
-        self.core.topics.remove(self.shared.topic.name());
+        let source: Weak<dyn TopicSource> = Arc::downgrade(&self.shared) as _;
+        self.core.topics.remove(self.shared.topic.name(), &source);
         let subscribers = std::mem::take(&mut self.shared.state.lock().subscribers);
         for subscriber in subscribers.into_values() {
             subscriber.added.notify_one();
@@ -340,6 +361,8 @@ impl Shared {
             content,
             published: SystemTime::now(),
         };
+        state.len = Some(sample.content.len() as u64);
+        state.measured_rate.count(Instant::now());
         if self.topic.latched > 0 {
             state.latched.push_back(sample.clone());
             while state.latched.len() > self.topic.latched {
@@ -372,7 +395,12 @@ impl Shared {
             name,
             keep,
             waiting: VecDeque::new(),
+            is_busy: false,
             added: Arc::default(),
+            delivered: 0,
+            replaced: 0,
+            failed: 0,
+            last_failure: None,
         };
         for sample in &state.latched {
             let sample = sample.clone();
@@ -394,10 +422,8 @@ impl Shared {
         let subscriber = state.subscribers.get_mut(&number)?;
         let was_full = subscriber.is_full(is_stream);
         let next = subscriber.waiting.pop_front();
-        let keep = match subscriber.keep.bound(is_stream) {
-            None => Keep::All,
-            Some(n) => Keep::latest(u32::try_from(n).unwrap_or(u32::MAX)),
-        };
+        subscriber.is_busy = next.is_some();
+        let keep = subscriber.effective_keep(is_stream);
         drop(state);
         if was_full {
             self.room.notify_waiters();
@@ -405,9 +431,44 @@ impl Shared {
         Some(next.map(|waiting| (waiting, keep)))
     }
 
+    /// Counts the outcome of the notification that was under way to a subscriber.
+    fn count(&self, number: u64, outcome: &Outcome) {
+        let mut state = self.state.lock();
+        if let Some(subscriber) = state.subscribers.get_mut(&number) {
+            subscriber.is_busy = false;
+            match outcome.is_success() {
+                true => subscriber.delivered += 1,
+                false => subscriber.fail(outcome.to_string()),
+            }
+        }
+    }
+
     fn remove(&self, number: u64) {
         drop(self.state.lock().subscribers.remove(&number));
         self.room.notify_waiters();
+    }
+}
+
+/// Maximum number of subscribers in the status of a topic.
+const MAX_LISTED: usize = 64;
+
+impl TopicSource for Shared {
+    fn status(&self) -> TopicStatus {
+        let state = self.state.lock();
+        let all = state.subscribers.values();
+        let mut first: Vec<SubscriberStatus> = all.map(|it| it.status(state.is_stream)).collect();
+        first.sort_unstable_by(|one, other| one.name.cmp(&other.name));
+        first.truncate(MAX_LISTED);
+        TopicStatus {
+            name: self.topic.name().to_owned(),
+            media_type: self.topic.media_type.clone(),
+            rate: self.topic.rate,
+            measured_rate: state.measured_rate.hertz(Instant::now()),
+            published: state.last_sample,
+            bytes: state.len,
+            subscribers: state.subscribers.len() as u64,
+            first_subscribers: first,
+        }
     }
 }
 
@@ -427,25 +488,52 @@ impl Subscriber {
 
     fn add(&mut self, waiting: Waiting, is_stream: bool) {
         if self.is_full(is_stream) {
+            self.fail(format!(
+                "{MAX_WAITING} notifications wait for the subscriber"
+            ));
             return waiting.settle(NotificationResult::TooSlow);
         }
         self.waiting.push_back(waiting);
         if let Some(most) = self.keep.bound(is_stream) {
             while self.waiting.len() > most {
                 if let Some(oldest) = self.waiting.pop_front() {
+                    self.replaced += 1;
                     oldest.settle(NotificationResult::Replaced);
                 }
             }
         }
         self.added.notify_one();
     }
+
+    fn fail(&mut self, reason: String) {
+        self.failed += 1;
+        self.last_failure = Some(reason);
+    }
+
+    fn status(&self, is_stream: bool) -> SubscriberStatus {
+        SubscriberStatus {
+            name: self.name.clone(),
+            keep: self.effective_keep(is_stream).to_string(),
+            delivered: self.delivered,
+            replaced: self.replaced,
+            failed: self.failed,
+            waiting: self.waiting.len() as u64 + u64::from(self.is_busy),
+            last_failure: self.last_failure.clone(),
+        }
+    }
+
+    /// The notifications that the subscriber gets.
+    fn effective_keep(&self, is_stream: bool) -> Keep {
+        match self.keep.bound(is_stream) {
+            None => Keep::All,
+            Some(n) => Keep::latest(u32::try_from(n).unwrap_or(u32::MAX)),
+        }
+    }
 }
 
-/// Has an agent refuse subscriptions to other topics than its own.
-fn declare(core: &Arc<AgentCore>, topic: &str) -> Result<(), DialogueError> {
-    if !core.topics.add(topic) {
-        return Ok(());
-    }
+/// Starts the tasks of an agent that publishes its first topic: subscriptions to other topics are refused, questions for
+/// the topics are answered, and the directory facilitator lists them.
+fn start(core: &Arc<AgentCore>) -> Result<(), DialogueError> {
     let agent = Arc::downgrade(core);
     let opens = opening(core, "fipa-subscribe", move |_| {
         agent.upgrade().is_some_and(|core| !core.topics.is_empty())
@@ -457,6 +545,7 @@ fn declare(core: &Arc<AgentCore>, topic: &str) -> Result<(), DialogueError> {
             refuse(queue.agent(), &first, &queue.agent().topics.refusal());
         }
     });
+    runtime.spawn(listing::list(Arc::downgrade(core), answer_questions(core)?));
     Ok(())
 }
 
@@ -559,6 +648,9 @@ async fn notify(
                     delivery.outcome,
                     Outcome::Failed { reason: FailureReason::NoSuchAgent, .. }
                 );
+                if let Some(shared) = shared.upgrade() {
+                    shared.count(number, &delivery.outcome);
+                }
                 if let Some(result) = result {
                     // The publisher may not wait for it.
                     let _ = result.send(NotificationResult::Outcome(delivery.outcome));

@@ -15,6 +15,8 @@ use crate::protocol::keep::MAX_KEPT;
 #[derive(Debug, Clone, PartialEq)]
 pub struct Topic {
     name: String,
+    /// The media type of the contents, if it is known.
+    pub(super) media_type: Option<String>,
     /// Notifications per second, if they are known.
     pub(super) rate: Option<f64>,
     /// Number of contents that are kept for new subscribers.
@@ -31,10 +33,19 @@ impl Topic {
     pub fn new(name: impl Into<String>) -> Self {
         Self {
             name: name.into(),
+            media_type: None,
             rate: None,
             latched: 0,
             wait: WAIT,
         }
+    }
+
+    /// Sets the media type of the contents, for example `image/jpeg`. It is shown to users; subscribers get no other
+    /// contents for it.
+    #[must_use]
+    pub fn media_type(mut self, media_type: impl Into<String>) -> Self {
+        self.media_type = Some(media_type.into());
+        self
     }
 
     /// Sets the number of notifications per second. The topic is then a stream: subscribers get the newest
