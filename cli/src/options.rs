@@ -63,7 +63,8 @@ fn with_meant_command(mut error: clap::Error) -> clap::Error {
         _ => return error,
     };
     let meant: &[&str] = match word {
-        "topic" | "topics" | "pub" => &["publish", "subscribe"],
+        "topic" => &["topics", "publish", "subscribe"],
+        "pub" => &["publish"],
         "sub" => &["subscribe"],
         "list" | "ls" | "ps" | "node" | "nodes" | "info" | "status" => &["agents"],
         "service" | "services" | "call" => &["request", "df"],

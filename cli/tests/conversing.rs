@@ -293,6 +293,36 @@ fn publish_gives_each_subscriber_the_newest_value() {
 }
 
 #[test]
+fn topics_lists_topics_with_their_rates_and_subscribers() {
+    let host = Host::new();
+    let publish = ["publish", "camera", "image", "xyz", "--rate", "100"];
+    let _camera = host.start(&[&publish[..], &["--type", "text/plain"]].concat());
+    let mut viewer = host.start(&["subscribe", "camera", "image", "--json"]);
+    viewer.line();
+    // Without a gateway, all agents are asked.
+    let alone = host.run(&["topics"]).done();
+    assert!(alone.contains("camera"), "{alone}");
+    let gateway = host.start(&["up", "--set", "discovery.mdns=false"]);
+    until("the gateway lists the topic", || {
+        let listed: Value = serde_json::from_str(&host.run(&["topics", "--json"]).done()).unwrap();
+        let topic = &listed[0]["topics"][0];
+        listed[0]["agent"] == "camera"
+            && topic["media_type"] == "text/plain"
+            && topic["rate"] == 100.0
+            && topic["subscribers"] == 1
+    });
+    let one = host.run(&["topics", "camera"]).done();
+    for part in ["text/plain", "(100)", "fipa-subscribe-", "latest(1)"] {
+        assert!(one.contains(part), "{one}");
+    }
+    let watched = host.run(&["topics", "--watch", "--for", "2s"]).done();
+    assert!(watched.matches("AGENT").count() > 1, "{watched}");
+    let unknown = host.run(&["topics", "nobody"]).failed(1);
+    assert!(unknown.contains("no such agent"), "{unknown}");
+    drop(gateway);
+}
+
+#[test]
 fn publish_sends_the_lines_of_its_input_and_ends_with_it() {
     let host = Host::new();
     let mut publish = host.command(&["publish", "door", "events", "-", "--json"]);
@@ -346,7 +376,7 @@ fn the_receiver_and_the_content_of_send_need_no_options() {
 fn words_of_other_tools_lead_to_the_command() {
     let host = Host::new();
     for (word, command) in [
-        ("topics", "'publish', 'subscribe'"),
+        ("topic", "'topics', 'publish', 'subscribe'"),
         ("list", "'agents'"),
         ("ps", "'agents'"),
         ("node", "'agents'"),

@@ -29,6 +29,7 @@ mod request;
 mod routes;
 mod send;
 mod subscribe;
+mod topics;
 mod up;
 mod watch;
 
@@ -48,6 +49,7 @@ pub(crate) enum Command {
     Request(request::Arguments),
     Publish(publish::Arguments),
     Subscribe(subscribe::Arguments),
+    Topics(topics::Arguments),
     Ping(ping::Arguments),
     Coalition(coalition::Arguments),
     #[command(subcommand)]
@@ -88,6 +90,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Request(arguments) => request::run(arguments, global),
         Command::Publish(arguments) => publish::run(arguments, global),
         Command::Subscribe(arguments) => subscribe::run(arguments, global),
+        Command::Topics(arguments) => topics::run(arguments, global),
         Command::Ping(arguments) => ping::run(arguments, global),
         Command::Coalition(arguments) => coalition::run(arguments, global),
         Command::Df(arguments) => df::run(arguments, global),

@@ -30,14 +30,14 @@ use crate::report::{self, Failure};
 /// Without --rate, the value is published once and stays. With `-` as the value, each line of the standard input is
 /// published; the command ends with the input, when all subscribers have the last line.
 ///
-/// `fipa subscribe NAME TOPIC` prints the values.
+/// `fipa subscribe NAME TOPIC` prints the values, and `fipa topics NAME` shows the subscribers.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa publish battery charge 80.5
   fipa publish clock ticks tick --rate 2
   vmstat -n 1 | fipa publish host load -
-  fipa publish camera image --content-file picture.jpg --rate 30
+  fipa publish camera image --content-file picture.jpg --type image/jpeg --rate 30
 
 In another terminal:
   fipa subscribe battery charge
@@ -61,6 +61,10 @@ pub(crate) struct Arguments {
     /// Value: the bytes of this file, which is read for each publication
     #[arg(long, value_name = "FILE", conflicts_with = "value")]
     content_file: Option<PathBuf>,
+
+    /// Media type of the values, which `fipa topics` shows, for example image/jpeg
+    #[arg(long = "type", value_name = "TYPE")]
+    media_type: Option<String>,
 
     /// Publish the value this number of times per second, for example 30 or 0.5. The topic is a stream then: a
     /// subscriber gets the newest value unless it asks for others
@@ -105,6 +109,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn publish(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result<(), Failure> {
     let mut topic = Topic::new(arguments.topic.clone()).latched(1);
+    if let Some(media_type) = &arguments.media_type {
+        topic = topic.media_type(media_type);
+    }
     if let Some(rate) = arguments.rate {
         topic = topic.rate(rate);
     }

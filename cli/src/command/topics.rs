@@ -1,0 +1,309 @@
+//! `fipa topics`: lists the topics of agents, their rates and their subscribers.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::Args;
+use fipa::platform::{AgentDescription, PlatformError, ServiceDescription};
+use fipa::protocol::DialogueError;
+use fipa::topics::{SubscriberStatus, TopicStatus, TopicsError};
+use fipa::{Agent, AgentId, Config, Domain, Reach, Role};
+use fipa_acl::{escape, escape_name};
+use serde_json::{Value, json};
+use tokio::task::JoinSet;
+
+use super::df::asking;
+use super::request::in_full;
+use crate::complete;
+use crate::membership::{self, Stop};
+use crate::options::{self, Global};
+use crate::output;
+use crate::report::Failure;
+
+/// List the topics of agents, with their rates and subscribers
+///
+/// Without an agent, all agents of this host and of connected hosts are listed that publish topics. Without a gateway,
+/// all agents of this host are asked. With an agent, each subscriber is listed, too, with its counts and its last
+/// failure: they show why one of them gets nothing.
+///
+/// RATE is measured over the last 32 values; the declared rate is in parentheses. BYTES is the length of the newest value.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa topics
+  fipa topics camera                  with the subscribers
+  fipa topics camera --watch
+  fipa topics --json
+
+The values of a topic:
+  fipa subscribe camera image
+
+JSON, with --watch one array on each line:
+  [ { \"agent\": name, \"topics\": null if the agent does not answer, or [ { \"name\", \"media_type\", \"rate\": declared,
+      \"measured_rate\", \"published\": number, \"bytes\", \"subscribers\": number,
+      \"first_subscribers\": [ { \"name\", \"keep\", \"delivered\", \"replaced\", \"failed\", \"waiting\",
+      \"last_failure\" } ] } ] } ]")]
+pub(crate) struct Arguments {
+    /// Name of the agent [default: all agents that publish topics]
+    #[arg(add = complete::agents())]
+    agent: Option<AgentId>,
+
+    /// Repeat the list each second until Ctrl-C
+    #[arg(long, short)]
+    watch: bool,
+
+    /// With --watch: end after this time, for example 10s
+    #[arg(long = "for", value_name = "TIME", requires = "watch", value_parser = options::duration)]
+    time: Option<Duration>,
+
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Time between two lists of --watch.
+const INTERVAL: Duration = Duration::from_secs(1);
+
+/// Clears a terminal and moves the cursor to its first line.
+const CLEAR: &str = "\x1b[2J\x1b[H";
+
+/// The topics of agents by name; `None` if an agent does not answer.
+type Listed = BTreeMap<String, Option<Vec<TopicStatus>>>;
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    if !arguments.watch {
+        return membership::run(async {
+            let domain = membership::join(&config).await?;
+            let listed = async {
+                let agent = asking(&domain, "topics", &config).await?;
+                let listed = list(&Arc::new(agent), &arguments, &config).await?;
+                print(&listed, &arguments)
+            };
+            let listed = listed.await;
+            domain.close().await;
+            listed
+        });
+    }
+    let register = async |domain: &Domain| asking(domain, "topics", &config).await;
+    let watch = async |agent: &Agent, stop: &mut Stop| {
+        let agent = Arc::new(agent.clone());
+        let mut turns = tokio::time::interval(INTERVAL);
+        turns.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let print_all = async {
+            loop {
+                turns.tick().await;
+                let listed = list(&agent, &arguments, &config).await?;
+                print(&listed, &arguments)?;
+            }
+        };
+        tokio::select! {
+            ended = print_all => ended,
+            () = stop.requested() => Ok(()),
+            () = options::after(arguments.time) => Ok(()),
+        }
+    };
+    membership::run_agent(&config, register, watch)
+}
+
+async fn list(
+    agent: &Arc<Agent>,
+    arguments: &Arguments,
+    config: &Config,
+) -> Result<Listed, Failure> {
+    if let Some(publisher) = &arguments.agent {
+        let topics = agent.topics_of(publisher).await;
+        let topics = topics.map_err(|error| failed(&error, publisher, config))?;
+        return Ok([(publisher.name().to_owned(), Some(topics))].into());
+    }
+    match agent.df() {
+        Ok(df) => {
+            let topics = AgentDescription {
+                services: vec![ServiceDescription::of_type("topic")],
+                ..AgentDescription::default()
+            };
+            let found = df.search(&topics).await;
+            let found = found.map_err(|error| super::df::failed(&error, config))?;
+            let names = found.into_iter().filter_map(|it| it.name);
+            Ok(ask_all(agent, names).await)
+        }
+        Err(PlatformError::NoAgent(_)) => {
+            let directory = agent.domain().directory();
+            directory.refresh();
+            let entries = directory.entries();
+            let here = entries.iter().filter(|entry| {
+                entry.role == Role::Agent
+                    && entry.reach == Reach::Local
+                    && *entry.name != *agent.name()
+            });
+            let names = here.filter_map(|entry| AgentId::new(&*entry.name).ok());
+            let mut listed = ask_all(agent, names).await;
+            // An agent without topics does not answer.
+            listed.retain(|_, topics| topics.is_some());
+            Ok(listed)
+        }
+        Err(error) => Err(super::df::failed(&error, config)),
+    }
+}
+
+/// Asks agents for their topics at the same time.
+async fn ask_all(agent: &Arc<Agent>, publishers: impl Iterator<Item = AgentId>) -> Listed {
+    let mut asked = JoinSet::new();
+    for publisher in publishers {
+        let agent = Arc::clone(agent);
+        asked.spawn(async move {
+            let topics = agent.topics_of(&publisher).await;
+            (publisher.name().to_owned(), topics)
+        });
+    }
+    let mut listed = Listed::new();
+    while let Some(answered) = asked.join_next().await {
+        match answered {
+            Ok((name, Ok(topics))) => {
+                listed.insert(name, Some(topics));
+            }
+            Ok((name, Err(error))) => {
+                tracing::debug!(agent = %escape_name(&name), %error, "the agent tells no topics");
+                listed.insert(name, None);
+            }
+            Err(error) => tracing::debug!(%error, "a question has ended"),
+        }
+    }
+    listed
+}
+
+fn print(listed: &Listed, arguments: &Arguments) -> Result<(), Failure> {
+    if arguments.json {
+        let agents = listed.iter().map(|(agent, topics)| {
+            let topics = topics.as_ref();
+            let topics = topics.map(|all| all.iter().map(status).collect::<Vec<Value>>());
+            json!({ "agent": agent, "topics": topics })
+        });
+        let agents: Vec<Value> = agents.collect();
+        return match arguments.watch {
+            true => output::json_line(&agents),
+            false => output::json(&agents),
+        };
+    }
+    let mut text = match arguments.watch && output::terminal_width().is_some() {
+        true => CLEAR.to_owned(),
+        false => String::new(),
+    };
+    if listed.values().flatten().all(Vec::is_empty) && listed.values().all(Option::is_some) {
+        text.push_str("no agent publishes a topic\n");
+        return output::text(&text);
+    }
+    let mut table = output::table(["AGENT", "TOPIC", "TYPE", "RATE", "BYTES", "SUBSCRIBERS"]);
+    for (agent, topics) in listed {
+        let agent = escape_name(agent).into_owned();
+        match topics {
+            Some(topics) => {
+                for topic in topics {
+                    let media_type = topic.media_type.as_deref();
+                    table.add_row([
+                        agent.clone(),
+                        escape(&topic.name).into_owned(),
+                        media_type.map_or_else(|| "-".to_owned(), |it| escape(it).into_owned()),
+                        rate(topic),
+                        topic
+                            .bytes
+                            .map_or_else(|| "-".to_owned(), |it| it.to_string()),
+                        topic.subscribers.to_string(),
+                    ]);
+                }
+            }
+            None => {
+                table.add_row([agent.as_str(), "(does not answer)", "-", "-", "-", "-"]);
+            }
+        }
+    }
+    // Writing to a string cannot fail.
+    let _ = writeln!(text, "{table}");
+    if arguments.agent.is_some() {
+        let topics = listed.values().flatten().flatten();
+        for topic in topics.filter(|topic| !topic.first_subscribers.is_empty()) {
+            let _ = write!(text, "\n{}", subscribers(topic));
+        }
+    }
+    output::text(&text)
+}
+
+/// The subscribers of a topic, in a table.
+fn subscribers(topic: &TopicStatus) -> String {
+    let mut text = format!("subscribers to {}:\n", escape(&topic.name));
+    let mut table = output::table([
+        "SUBSCRIBER",
+        "KEEP",
+        "DELIVERED",
+        "REPLACED",
+        "FAILED",
+        "WAITING",
+    ]);
+    let mut failures = String::new();
+    for subscriber in &topic.first_subscribers {
+        let name = escape_name(&subscriber.name);
+        table.add_row([
+            name.clone().into_owned(),
+            escape(&subscriber.keep).into_owned(),
+            subscriber.delivered.to_string(),
+            subscriber.replaced.to_string(),
+            subscriber.failed.to_string(),
+            subscriber.waiting.to_string(),
+        ]);
+        if let Some(failure) = &subscriber.last_failure {
+            let _ = writeln!(failures, "last failure of {name}: {}", escape(failure));
+        }
+    }
+    let _ = write!(text, "{table}\n{failures}");
+    let listed = topic.first_subscribers.len() as u64;
+    if topic.subscribers > listed {
+        let _ = writeln!(text, "and {} more", topic.subscribers - listed);
+    }
+    text
+}
+
+/// The measured rate, and in parentheses the declared one.
+fn rate(topic: &TopicStatus) -> String {
+    let measured = topic.measured_rate.map(|hertz| format!("{hertz:.1} Hz"));
+    match (measured, topic.rate) {
+        (Some(measured), Some(declared)) => format!("{measured} ({declared})"),
+        (Some(measured), None) => measured,
+        (None, Some(declared)) => format!("({declared} Hz)"),
+        (None, None) => "-".to_owned(),
+    }
+}
+
+fn status(topic: &TopicStatus) -> Value {
+    let subscriber = |it: &SubscriberStatus| {
+        json!({
+            "name": it.name, "keep": it.keep, "delivered": it.delivered, "replaced": it.replaced,
+            "failed": it.failed, "waiting": it.waiting, "last_failure": it.last_failure,
+        })
+    };
+    let first: Vec<Value> = topic.first_subscribers.iter().map(subscriber).collect();
+    json!({
+        "name": topic.name, "media_type": topic.media_type, "rate": topic.rate,
+        "measured_rate": topic.measured_rate, "published": topic.published, "bytes": topic.bytes,
+        "subscribers": topic.subscribers, "first_subscribers": first,
+    })
+}
+
+fn failed(error: &TopicsError, agent: &AgentId, config: &Config) -> Failure {
+    let problem = match error {
+        TopicsError::Dialogue(error) => in_full(error),
+        other => fipa::error::ErrorChain(other).to_string(),
+    };
+    let help = match error {
+        TopicsError::Dialogue(DialogueError::TimedOut | DialogueError::NotUnderstood(_)) => {
+            "the agent may publish no topics; `fipa topics` lists the agents that do"
+        }
+        _ => "check with `fipa agents` whether the agent is known",
+    };
+    Failure::failed(
+        format!("{} tells no topics: {problem}", escape_name(agent.name())),
+        format!("domain {}", config.domain),
+        help,
+    )
+}
