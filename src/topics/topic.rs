@@ -49,7 +49,7 @@ impl Topic {
     }
 
     /// Sets the number of notifications per second. The topic is then a stream: subscribers get the newest
-    /// notification unless they ask for others ([`Keep::Auto`]).
+    /// notification unless they ask for others ([`Keep::Auto`](crate::protocol::Keep::Auto)).
     #[must_use]
     pub fn rate(mut self, hertz: f64) -> Self {
         self.rate = Some(hertz);
@@ -64,7 +64,7 @@ impl Topic {
     }
 
     /// Sets the time for which one call of [`Publisher::publish`](super::Publisher::publish) waits at most for a
-    /// subscriber that asks for [all](Keep::All) notifications and has 64 that wait. 5 s by default.
+    /// subscriber that asks for [all](crate::protocol::Keep::All) notifications and has 64 that wait. 5 s by default.
     #[must_use]
     pub fn wait_for_slow(mut self, wait: Duration) -> Self {
         self.wait = wait;
