@@ -58,3 +58,32 @@ fn an_invalid_pattern_is_rejected() {
     let output = host.run(&["routes", "arm_("]).failed(2);
     assert!(output.contains("regular expression"), "{output}");
 }
+
+#[test]
+fn a_route_applies_to_a_receiver_on_the_same_host() {
+    let host = Host::new();
+    let tcp = "routes={ arm_1 = [\"tcp\"], \"crex_.*\" = [\"tcp\"] }";
+    let processes = "transport.tcp.processes=true";
+    let arm = host.start(&["echo", "arm_1", "--set", processes]);
+    let send = ["send", "arm_1", "hello", "--json", "--set", tcp];
+    let sent = host.run(&[&send, &["--set", processes][..]].concat());
+    let sent = sent.done_json();
+    assert_eq!(sent["deliveries"][0]["via"], "tcp", "{sent}");
+    let table = host.run(&["routes", "--set", processes, "--set", tcp]);
+    let table = table.done();
+    let reason = "not used: transport not listed in routes.\"arm_1\"";
+    assert!(table.contains(reason), "{table}");
+
+    // Without ports of processes, the route leads nowhere: the letter takes no other transport.
+    let (failed, _) = host.run(&send).failed_json();
+    let delivery = &failed["deliveries"][0];
+    assert_eq!(delivery["reason"], "unreachable", "{failed}");
+    let table = host.run(&["routes", "--set", tcp]).done();
+    let reason = "not used: transport.tcp.processes is false, so only the gateway uses tcp";
+    assert!(table.contains(reason), "{table}");
+    let table = host.run(&["routes", "--set", "mts.transports=shm,unix"]);
+    let table = table.done();
+    let reason = "not used: transport not listed in mts.transports";
+    assert!(table.contains(reason), "{table}");
+    drop(arm);
+}

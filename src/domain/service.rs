@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::ErrorChain;
-use fipa_mts::core::CoreConfig;
+use fipa_mts::core::{CoreConfig, RouteException};
 use fipa_mts::{AccessGate, Contacts, Mts, RuntimeConfig, Started};
 use fipa_sds::{Cancellation, Directory, Entry, HostDirectory, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Signature, Transport, log_limit};
@@ -361,16 +361,20 @@ fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> Co
     }
 }
 
-/// Returns `[routes]` of the configuration, restricted to the transports in use. Lines that list only
-/// transports between hosts apply to the gateway.
-fn routes(config: &Config, order: &[Kind], gateway: bool) -> Vec<(Pattern, Vec<Kind>)> {
+/// Returns `[routes]` of the configuration, restricted to the transports in use. In a robot process, a line that
+/// lists only transports between hosts says nothing about the route to the gateway, so it applies to receivers on
+/// this host.
+fn routes(config: &Config, order: &[Kind], gateway: bool) -> Vec<RouteException> {
     let routes = config.routes.iter().filter_map(|route| {
         // Always compiles, because the check of the configuration has compiled it.
-        let pattern = Pattern::new(&route.receiver).ok()?;
+        let receivers = Pattern::new(&route.receiver).ok()?;
         let used = route.transports.iter().copied();
-        let used: Vec<Kind> = used.filter(|kind| order.contains(kind)).collect();
-        let names_local = route.transports.iter().any(|kind| kind.is_host_local());
-        (gateway || names_local || !used.is_empty()).then_some((pattern, used))
+        let is_within_host = route.transports.iter().any(|kind| kind.is_host_local());
+        Some(RouteException {
+            receivers,
+            order: used.filter(|kind| order.contains(kind)).collect(),
+            only_on_this_host: !gateway && !is_within_host,
+        })
     });
     routes.collect()
 }

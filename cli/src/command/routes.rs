@@ -5,7 +5,7 @@ use std::time::Duration;
 use clap::Args;
 use comfy_table::Table;
 use fipa::admin::routes::{Connected, Route, RouteReport, RouteState, Standing};
-use fipa::{Matcher, Query};
+use fipa::{Config, Kind, Location, Matcher, Query, Signature};
 use fipa_acl::{escape, escape_name};
 use serde_json::json;
 
@@ -103,18 +103,24 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let domain = &config.domain;
         return output::text(&format!("no agent{named} is known in domain {domain}\n"));
     }
-    output::text(&described(&process, gateway.as_ref()))
+    output::text(&described(&process, gateway.as_ref(), &config))
 }
 
-fn described(process: &RouteReport, gateway: Option<&RouteReport>) -> String {
+fn described(process: &RouteReport, gateway: Option<&RouteReport>, config: &Config) -> String {
     let mut text = String::new();
     let mut table = output::table(["TO", "FROM", "ROUTE", "STATUS"]);
     for route in &process.routes {
-        rows_of(&mut table, route, "this host");
+        rows_of(&mut table, route, "this host", |location| {
+            unused_by_process(route, location, config)
+        });
         let remote = gateway.filter(|_| route.gateway.is_some());
         let same = |other: &&Route| other.incarnation == route.incarnation;
-        if let Some(onward) = remote.and_then(|it| it.routes.iter().find(same)) {
-            rows_of(&mut table, onward, "gateway");
+        if let Some((gateway, onward)) =
+            remote.and_then(|it| Some((it, it.routes.iter().find(same)?)))
+        {
+            rows_of(&mut table, onward, "gateway", |location| {
+                unused_by_gateway(onward, location, gateway)
+            });
         }
     }
     text.push_str(&format!("{}\n", table.trim_fmt()));
@@ -216,7 +222,8 @@ fn fingerprint(certificate: &str) -> &str {
     certificate.get(..16).unwrap_or(certificate)
 }
 
-fn rows_of(table: &mut Table, route: &Route, from: &str) {
+/// Adds the rows of a route. `unused` returns the reason why no letter takes a location.
+fn rows_of(table: &mut Table, route: &Route, from: &str, unused: impl Fn(&Location) -> String) {
     let receiver = match &route.exception {
         Some(pattern) => format!("{} (by routes.{pattern:?})", escape_name(&route.receiver)),
         None => escape_name(&route.receiver).into_owned(),
@@ -233,13 +240,57 @@ fn rows_of(table: &mut Table, route: &Route, from: &str) {
     for way in &route.ways {
         let to = if first { receiver.as_str() } else { "" };
         let from = if first { from } else { "" };
-        let mut standing = standing(&way.standing);
-        if !matches!(way.standing, Standing::NotInOrder | Standing::Unsupported) {
-            standing = format!("{}, {standing}", if first { "first" } else { "then" });
-        }
-        table.add_row([to, from, &way.location.to_string(), &standing]);
+        let place = if first { "first" } else { "then" };
+        let status = match &way.standing {
+            Standing::NotInOrder => format!("not used: {}", unused(&way.location)),
+            Standing::Unsupported => standing(&way.standing),
+            used => format!("{place}, {}", standing(used)),
+        };
+        table.add_row([to, from, &way.location.to_string(), &status]);
         first = false;
     }
+}
+
+/// The reason why a process does not use a location of a receiver.
+fn unused_by_process(route: &Route, location: &Location, config: &Config) -> String {
+    let kind = location.kind();
+    let rule = route
+        .exception
+        .as_ref()
+        .and_then(|pattern| config.routes.iter().find(|it| it.receiver == *pattern));
+    match rule {
+        _ if is_for_legacy_peers(location) => FOR_LEGACY_PEERS.to_owned(),
+        _ if !config.mts.transports.contains(&kind) => NOT_LISTED.to_owned(),
+        Some(rule) if !rule.transports.contains(&kind) => not_in_rule(&rule.receiver),
+        _ if kind == Kind::Tcp && !config.transport.tcp.processes => {
+            "transport.tcp.processes is false, so only the gateway uses tcp".to_owned()
+        }
+        _ => format!("only the gateway uses {kind}"),
+    }
+}
+
+/// The reason why the gateway, which uses all transports that it lists, does not use a location of a receiver.
+fn unused_by_gateway(route: &Route, location: &Location, gateway: &RouteReport) -> String {
+    let listed = gateway.configuration.get("mts.transports");
+    let is_listed = listed.is_some_and(|it| it.contains(&format!("\"{}\"", location.kind())));
+    match &route.exception {
+        _ if is_for_legacy_peers(location) => FOR_LEGACY_PEERS.to_owned(),
+        Some(pattern) if is_listed => not_in_rule(pattern),
+        _ => NOT_LISTED.to_owned(),
+    }
+}
+
+const NOT_LISTED: &str = "transport not listed in mts.transports";
+
+const FOR_LEGACY_PEERS: &str = "for letters of legacy peers";
+
+/// Whether a service of this project takes only letters of legacy peers at this location.
+fn is_for_legacy_peers(location: &Location) -> bool {
+    location.signature() != Signature::Frames && location.incarnation().is_known()
+}
+
+fn not_in_rule(pattern: &str) -> String {
+    format!("transport not listed in routes.{pattern:?}")
 }
 
 fn standing(standing: &Standing) -> String {
@@ -257,7 +308,7 @@ fn standing(standing: &Standing) -> String {
                 escape(error)
             )
         }
-        Standing::NotInOrder => "not used: transport not listed in mts.transports".to_owned(),
+        Standing::NotInOrder => "not used".to_owned(),
         Standing::Unsupported => "not used: unsupported transport".to_owned(),
         _ => "unknown state".to_owned(),
     }

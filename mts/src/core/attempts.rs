@@ -189,7 +189,7 @@ impl AttemptTable {
         entry: &Entry,
         tried: &[Location],
     ) -> Option<Location> {
-        let order = self.config.order_for(&entry.name);
+        let order = self.config.order_for(&entry.name, entry.reach);
         self.routes.choose(now, order, entry, tried)
     }
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_sds::Pattern;
+use fipa_sds::{Pattern, Reach};
 use fipa_transport::{Incarnation, Kind, Location, Signature};
 
 use crate::dial::Network;
@@ -11,6 +11,18 @@ use crate::dial::Network;
 /// Maximum deadline of a letter. Receivers remember taken letters for at least this long, so that
 /// none is delivered twice.
 pub const MAX_DEADLINE: Duration = fipa_transport::wire::MAX_REMAINING;
+
+/// The order of transports for letters to particular receivers.
+#[derive(Debug, Clone)]
+pub struct RouteException {
+    /// The names of the receivers.
+    pub receivers: Pattern,
+    /// Transports in order of preference; others are not used.
+    pub order: Vec<Kind>,
+    /// Whether letters to receivers on other hosts take the order of [`CoreConfig::order`]. In a robot process such a
+    /// letter goes to the gateway first, which has an order of its own.
+    pub only_on_this_host: bool,
+}
 
 /// Configuration of the delivery core.
 #[derive(Debug, Clone)]
@@ -26,7 +38,7 @@ pub struct CoreConfig {
     /// Transports in order of preference; others are not used.
     pub order: Vec<Kind>,
     /// Other orders for receivers whose name matches; the first match counts.
-    pub routes: Vec<(Pattern, Vec<Kind>)>,
+    pub routes: Vec<RouteException>,
     /// Number of letters in an agent's queue at which its senders are held back.
     pub queue: usize,
     /// Bytes of letters in an agent's queue at which its senders are held back. An empty queue
@@ -84,17 +96,18 @@ impl CoreConfig {
         }
     }
 
-    /// The order of transports for letters to this receiver.
-    pub(crate) fn order_for(&self, receiver: &str) -> &[Kind] {
-        self.route_for(receiver).1
+    /// The order of transports for letters to this receiver, which can be reached in this way.
+    pub(crate) fn order_for(&self, receiver: &str, reach: Reach) -> &[Kind] {
+        self.route_for(receiver, reach).1
     }
 
-    /// The order of transports for letters to this receiver, and the pattern of the exception that
-    /// selects it, if any.
-    pub(crate) fn route_for(&self, receiver: &str) -> (Option<&Pattern>, &[Kind]) {
+    /// The order of transports for letters to this receiver, which can be reached in this way, and the
+    /// pattern of the exception that selects it, if any.
+    pub(crate) fn route_for(&self, receiver: &str, reach: Reach) -> (Option<&Pattern>, &[Kind]) {
         let mut routes = self.routes.iter();
-        match routes.find(|(pattern, _)| pattern.matches(receiver)) {
-            Some((pattern, order)) => (Some(pattern), order),
+        let exception = routes.find(|exception| exception.receivers.matches(receiver));
+        match exception.filter(|it| !it.only_on_this_host || reach == Reach::Local) {
+            Some(exception) => (Some(&exception.receivers), &exception.order),
             None => (None, &self.order),
         }
     }

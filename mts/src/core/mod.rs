@@ -89,12 +89,12 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
-use fipa_sds::{Pattern, View};
+use fipa_sds::View;
 use fipa_transport::{AttemptId, Conclusion, FailureReason, Incarnation, Kind};
 
 pub use self::action::Action;
 use self::attempts::{AttemptTable, Purpose};
-pub use self::config::{CoreConfig, MAX_DEADLINE};
+pub use self::config::{CoreConfig, MAX_DEADLINE, RouteException};
 pub use self::failures::Undecodable;
 pub use self::ids::SubmissionId;
 use self::ids::{LaneId, LaneKey};
@@ -371,7 +371,7 @@ impl Core {
 
     /// Replaces the orders of transports, also for waiting letters. Attempts in progress are not
     /// affected.
-    pub fn reorder(&mut self, now: Now, order: Vec<Kind>, routes: Vec<(Pattern, Vec<Kind>)>) {
+    pub fn reorder(&mut self, now: Now, order: Vec<Kind>, routes: Vec<RouteException>) {
         self.table.config.order = order;
         self.table.config.routes = routes;
         self.static_peers.reorder(now.instant, &mut self.table);

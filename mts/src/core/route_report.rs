@@ -90,7 +90,7 @@ pub struct RouteState {
 impl AttemptTable {
     /// The route that letters to this agent would take now.
     pub(super) fn route(&self, now: Instant, entry: &Entry) -> Route {
-        let (exception, order) = self.config.route_for(&entry.name);
+        let (exception, order) = self.config.route_for(&entry.name, entry.reach);
         let mut ways = Vec::new();
         let mut tried: Vec<Location> = Vec::new();
         while let Some(location) = self.choose(now, entry, &tried) {

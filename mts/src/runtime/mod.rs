@@ -21,7 +21,7 @@ use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Letter};
-use fipa_sds::{Change, Directory, Entry, Pattern, View};
+use fipa_sds::{Change, Directory, Entry, View};
 use fipa_transport::{
     Abandoned, Attempt, Conclusion, Incarnation, Introduction, Kind, ListenError, Location,
     Outcome, OwnerProcess, Principal, Transport, TransportError, TransportErrorKind, log_limit,
@@ -37,7 +37,7 @@ use crate::AccessGate;
 use crate::Map;
 use crate::core::{
     Action, Core, CoreConfig, LetterReader, Notice, Now, Peer, PeerState, Received, Route,
-    RouteState, Submission, SubmissionId, Undecodable,
+    RouteException, RouteState, Submission, SubmissionId, Undecodable,
 };
 use crate::dial::listened_at;
 
@@ -477,7 +477,7 @@ impl Mts {
     pub fn reorder(
         &self,
         order: Vec<Kind>,
-        routes: Vec<(Pattern, Vec<Kind>)>,
+        routes: Vec<RouteException>,
         unframed_deadline: Duration,
     ) {
         let mut state = self.shared.lock();

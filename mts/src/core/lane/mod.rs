@@ -585,7 +585,7 @@ impl Lane {
             return true;
         }
         open_letter.progress.tried.clear();
-        if let Some(reason) = self.never_fits(now, index, table) {
+        if let Some(reason) = self.never_fits(now, index, entry.reach, table) {
             self.fail(now, index, reason, table);
             return true;
         }
@@ -611,13 +611,14 @@ impl Lane {
         &mut self,
         now: Instant,
         index: usize,
+        reach: Reach,
         table: &AttemptTable,
     ) -> Option<FailureReason> {
         let open_letter = &mut self.letters[index];
         let reason = open_letter.unfit()?;
         let since = *open_letter.progress.unfit_since.get_or_insert(now);
         let attempts = &open_letter.progress.attempts;
-        let mut order = table.config.order_for(&self.receiver).iter();
+        let mut order = table.config.order_for(&self.receiver, reach).iter();
         let is_legacy = |attempt: &Attempt| attempt.location.signature() != Signature::Frames;
         let waits = reason == FailureReason::TooLarge
             && now < since + KIND_TIMEOUT
