@@ -129,7 +129,7 @@ pub use any_error::{Error, Result};
 pub use config::Config;
 pub use domain::coalition::Coalition;
 pub use domain::directory_view::DirectoryView;
-pub use domain::{Domain, RegisterOptions};
+pub use domain::{Domain, Follower, RegisterOptions};
 pub use fipa_acl::{
     AgentId, Envelope, EnvelopeParams, Letter, Message, MessageBuilder, Payload, Performative,
     Problem, Time,

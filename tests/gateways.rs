@@ -424,7 +424,7 @@ async fn reloading_the_configuration_loses_no_letter() {
                     round % 9 + 1
                 ),
             ]);
-            assert_eq!(near.reload(&config).unwrap(), Vec::<String>::new());
+            assert_eq!(near.reload(&config).unwrap().later, Vec::<String>::new());
             if sending.is_finished() {
                 break;
             }
@@ -437,8 +437,8 @@ async fn reloading_the_configuration_loses_no_letter() {
             "a configuration with mistakes is refused"
         );
         config.mts.queue = 7;
-        let later = near.reload(&config).unwrap();
-        assert_eq!(later, ["mts.queue", "transport.tcp.listen"]);
+        let reloaded = near.reload(&config).unwrap();
+        assert_eq!(reloaded.later, ["mts.queue", "transport.tcp.listen"]);
     };
     tokio::join!(reading, changing);
     for deliveries in sending.await.unwrap() {

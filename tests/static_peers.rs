@@ -216,7 +216,7 @@ async fn both_agents_with_one_name_are_told_and_a_third_host_keeps_the_first() {
         address(&far)
     );
     watcher.discovery = config(&[&peers]).discovery;
-    assert_eq!(third.reload(&watcher).unwrap(), [""; 0]);
+    assert_eq!(third.reload(&watcher).unwrap().later, [""; 0]);
     until_async("the agents of the far host", || {
         third.directory().known("crane").is_some()
     })

@@ -36,6 +36,7 @@ fn main() -> ExitCode {
     complete::answer();
     let command_line = options::CommandLine::read();
     log_to_stderr(&command_line.global);
+    command_line.global.keep_sources();
     if let Err(error) = fipa::admin::open_files::raise() {
         tracing::debug!(%error, "cannot raise the limit of open files");
     }

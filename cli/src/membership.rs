@@ -1,7 +1,7 @@
 //! Shared code of the commands that join a domain: joining, registering, error reports, and an
 //! orderly end on a signal.
 
-use std::io::{self, IsTerminal};
+use std::io;
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,11 +9,15 @@ use std::time::Duration;
 use clap::Args;
 use fipa::admin::contact;
 use fipa::admin::routes::{self, AskError, RouteReport};
+use fipa::config::{ConfigError, Reloaded};
 use fipa::error::{DomainDirError, ErrorChain, ListenError, OpenError, RegisterError};
 use fipa::threads::ThreadError;
-use fipa::{Agent, AgentId, Config, Domain, Entry, Incarnation, Reach, RegisterOptions, Role};
+use fipa::{
+    Agent, AgentId, Config, Domain, Entry, Incarnation, Reach, RegisterOptions, Role, log_limit,
+};
 use fipa_acl::{escape, escape_name};
 use rustix::process::Signal;
+use tokio::signal::unix::{self, SignalKind};
 
 use crate::options;
 use crate::report::{self, Failure};
@@ -22,7 +26,8 @@ use crate::signals::Signals;
 /// Signals within this time after the first one count as the same request to end.
 const SIGNAL_GRACE: Duration = Duration::from_millis(500);
 
-/// The signals that end a command.
+/// The signals that end a command. SIGHUP ends it if the terminal from which it was started has been closed.
+/// Otherwise SIGHUP requests to read the configuration again, as it does of other services.
 pub(crate) struct Stop {
     signals: Signals,
     /// Whether the command was started from a terminal.
@@ -44,23 +49,22 @@ impl Stop {
     pub(crate) fn listen() -> Result<Self, Failure> {
         Ok(Self {
             signals: Signals::listen()?,
-            from_terminal: io::stdin().is_terminal(),
+            from_terminal: has_terminal(),
         })
     }
 
-    /// Waits for the next signal to a service. SIGHUP requests a reload, unless the terminal from which
-    /// the service was started has been closed.
+    /// Waits for the next signal.
     pub(crate) async fn next_request(&mut self) -> SignalRequest {
-        let closed = |from_terminal| from_terminal && !io::stdin().is_terminal();
+        let is_closed = |from_terminal| from_terminal && !has_terminal();
         match self.signals.next().await {
-            Signal::HUP if !closed(self.from_terminal) => SignalRequest::Reload,
+            Signal::HUP if !is_closed(self.from_terminal) => SignalRequest::Reload,
             _ => SignalRequest::End,
         }
     }
 
-    /// Waits for a signal.
+    /// Waits for a signal that ends the command. [`join`] handles requests to read the configuration again.
     pub(crate) async fn requested(&mut self) {
-        self.signals.next().await;
+        while let SignalRequest::Reload = self.next_request().await {}
     }
 
     /// Marks the start of the orderly end, which can take a while when another process delays it. A
@@ -101,10 +105,48 @@ pub(crate) fn run<T>(work: impl Future<Output = Result<T, Failure>>) -> Result<T
     })?
 }
 
-/// Joins the domain of the configuration.
+/// Whether this process has a terminal. The kernel takes a closed terminal from all processes that were started from it.
+fn has_terminal() -> bool {
+    std::fs::File::open("/dev/tty").is_ok()
+}
+
+/// Joins the domain of the configuration. From then on, `fipa reload` and SIGHUP make the process read it again.
 pub(crate) async fn join(config: &Config) -> Result<Domain, Failure> {
     let joined = Domain::open(config).await;
-    joined.map_err(|error| not_joined(error, config))
+    let domain = joined.map_err(|error| not_joined(error, config))?;
+    let follower = domain.follow(options::sources());
+    // Fails for lack of descriptors. SIGHUP then does nothing, or ends a command without `Stop`.
+    if let Ok(mut hang_up) = unix::signal(SignalKind::hangup()) {
+        tokio::spawn(async move {
+            while hang_up.recv().await.is_some() {
+                match follower.reload() {
+                    Some(reloaded) => report_reload(&reloaded),
+                    None => return,
+                }
+            }
+        });
+    }
+    Ok(domain)
+}
+
+/// Reports the result of reading the configuration again. After a mistake the process continues with the previous
+/// configuration.
+pub(crate) fn report_reload(reloaded: &Result<Reloaded, ConfigError>) {
+    match reloaded {
+        Ok(Reloaded { later, .. }) => {
+            log_limit::info!("configuration reloaded");
+            if !later.is_empty() {
+                let later = later.join(", ");
+                report::warn(&format!(
+                    "changes to {later} take effect when this process is restarted"
+                ));
+            }
+        }
+        Err(error) => report::warn(&format!(
+            "continuing with the previous configuration: {}",
+            ErrorChain(error)
+        )),
+    }
 }
 
 /// Joins the domain of the configuration, for a command that ends within a second.

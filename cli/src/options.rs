@@ -1,6 +1,7 @@
 //! The command line: the options all commands share.
 
 use std::path::PathBuf;
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use clap::error::{ContextKind, ContextValue};
@@ -171,6 +172,12 @@ impl Global {
         Effective::load(&self.sources())
     }
 
+    /// Keeps the sources of the configuration for [`sources`].
+    pub(crate) fn keep_sources(&self) {
+        // Fails in a second call, which gives the same.
+        let _ = SOURCES.set(self.sources());
+    }
+
     /// The sources of the configuration.
     pub(crate) fn sources(&self) -> Sources {
         Sources {
@@ -179,6 +186,17 @@ impl Global {
             ..Sources::from_environment()
         }
     }
+}
+
+/// The sources of the configuration of this command.
+static SOURCES: OnceLock<Sources> = OnceLock::new();
+
+/// Returns the sources of the configuration of this command, from which it can be read again.
+pub(crate) fn sources() -> Sources {
+    SOURCES
+        .get()
+        .cloned()
+        .unwrap_or_else(Sources::from_environment)
 }
 
 /// Parses a duration such as 10s.

@@ -7,7 +7,7 @@ use tokio::signal::unix::{self, SignalKind};
 
 use crate::report::Failure;
 
-/// SIGINT (Ctrl-C), SIGTERM (`kill`) and SIGHUP (a closed terminal).
+/// SIGINT (Ctrl-C), SIGTERM (`kill`) and SIGHUP (a closed terminal, or a request to read the configuration again).
 pub(crate) struct Signals {
     interrupt: unix::Signal,
     terminate: unix::Signal,

@@ -75,6 +75,11 @@ pub struct LetterParts {
 
 /// Decides which letters are accepted, for an agent of this service or into a gateway's custody.
 pub trait AccessGate: Send + Sync {
+    /// Whether the gate decides at present. While it does not, letters are neither read for it nor judged.
+    fn is_active(&self) -> bool {
+        true
+    }
+
     /// Reads the parts of a letter that the decision depends on. That takes time in proportion to
     /// the bytes of the letter, so the runtime calls it before it locks the core, and once for all
     /// receivers of the letter.

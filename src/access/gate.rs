@@ -4,6 +4,7 @@
 //! checks the letters to its own agents, because it must not rely on the checks of other processes.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use fipa_acl::{EnvelopeView, Letter, MessageView};
@@ -17,13 +18,14 @@ use crate::access::rules::{Access, LetterFacts, Refusal};
 /// Log target of the lines about refused letters.
 const AUDIT: &str = "fipa::audit";
 
-/// Checks every arriving letter against the rules.
+/// Checks every arriving letter against the rules, which can be replaced. Without rules it is inactive.
 pub(crate) struct RulesGate {
     access: Mutex<Access>,
     of: Of,
+    is_active: AtomicBool,
     /// Whether a rule names an action, so that contents are read.
     #[cfg(feature = "actions")]
-    names_actions: bool,
+    names_actions: AtomicBool,
 }
 
 /// The owner of a gate.
@@ -38,13 +40,27 @@ pub(crate) enum Of {
 }
 
 impl RulesGate {
-    pub(crate) fn new(access: Access, of: Of) -> Self {
+    /// Creates a gate without rules.
+    pub(crate) fn new(of: Of) -> Self {
         Self {
-            #[cfg(feature = "actions")]
-            names_actions: access.names_actions(),
-            access: Mutex::new(access),
+            access: Mutex::default(),
             of,
+            is_active: AtomicBool::new(false),
+            #[cfg(feature = "actions")]
+            names_actions: AtomicBool::new(false),
         }
+    }
+
+    /// Replaces the rules. The rates of senders are counted from the beginning.
+    pub(crate) fn set_rules(&self, rules: Option<Access>) {
+        let is_active = rules.is_some();
+        let rules = rules.unwrap_or_default();
+        // A letter that was read before has no action, so it is judged like one that is no goal.
+        #[cfg(feature = "actions")]
+        self.names_actions
+            .store(rules.names_actions(), Ordering::Release);
+        *self.access.lock() = rules;
+        self.is_active.store(is_active, Ordering::Release);
     }
 
     /// Reads the parts of a message with this sender in its envelope.
@@ -111,7 +127,7 @@ impl RulesGate {
     /// robot reads it, so that no other notation evades a rule.
     #[cfg(feature = "actions")]
     fn action(&self, message: &MessageView<'_>) -> Option<String> {
-        if !self.names_actions {
+        if !self.names_actions.load(Ordering::Acquire) {
             return None;
         }
         let content = message.content();
@@ -164,6 +180,10 @@ enum Refused {
 }
 
 impl AccessGate for RulesGate {
+    fn is_active(&self) -> bool {
+        self.is_active.load(Ordering::Acquire)
+    }
+
     fn read(&self, letter: &Letter) -> LetterParts {
         let envelope = letter.envelope();
         let view = EnvelopeView::parse(&envelope).ok();
@@ -268,7 +288,10 @@ mod tests {
             ..config::Access::default()
         };
         let access = rules.rules().unwrap().unwrap();
-        let gate = RulesGate::new(access, Of::Process(Arc::new(open(false))));
+        let gate = RulesGate::new(Of::Process(Arc::new(open(false))));
+        assert!(!gate.is_active());
+        gate.set_rules(Some(access));
+        assert!(gate.is_active());
         (gate, open(true), place)
     }
 

@@ -52,7 +52,7 @@ pub(crate) enum Refusal {
 pub struct RuleError(String);
 
 /// The rules, and the current rates of senders.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Access {
     deny: Vec<Rule>,
     allow: Vec<Rule>,

@@ -198,7 +198,7 @@ impl<'a> Robot<'a> {
 
     /// Returns the time for an answer: the deadlines of the message and of the answer.
     fn timeout(&self) -> Duration {
-        self.agent.domain().inner.deadline * 2
+        self.agent.domain().inner.deadline() * 2
     }
 
     fn message(&self, act: Performative, ask: &Ask) -> Result<MessageBuilder, ActionError> {

@@ -5,5 +5,6 @@ pub mod doctor;
 #[cfg(feature = "secure")]
 pub mod keys;
 pub mod open_files;
+pub mod reload;
 pub mod routes;
 pub mod watch;

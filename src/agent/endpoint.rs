@@ -222,7 +222,7 @@ impl Endpoint {
             .map_err(|error| error.to_string())
             .and_then(|answer| {
                 let letter = self.letter(&answer);
-                let deadline = self.domain.inner.deadline;
+                let deadline = self.domain.inner.deadline();
                 let sent = self
                     .submit(&answer, letter, deadline, Checked::No)
                     .map_err(|error| ErrorChain(&error).to_string())?;

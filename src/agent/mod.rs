@@ -249,7 +249,7 @@ impl Agent {
     where
         M: TryInto<Message, Error: Into<BuildError>>,
     {
-        self.send_within(message, self.core.endpoint.domain.inner.deadline)
+        self.send_within(message, self.core.endpoint.domain.inner.deadline())
     }
 
     /// Sends a message with the given deadline instead of the configured one.
@@ -339,7 +339,7 @@ impl Agent {
         &self,
         loan: Loan,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
-        self.send_loan_within(loan, self.core.endpoint.domain.inner.deadline)
+        self.send_loan_within(loan, self.core.endpoint.domain.inner.deadline())
     }
 
     /// Sends the message of a loan with the given deadline instead of the configured one.

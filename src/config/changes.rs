@@ -2,9 +2,46 @@
 
 use std::collections::BTreeMap;
 
+use serde::{Deserialize, Serialize};
+
 use super::Config;
 use super::keys::dotted;
 use super::keys::{KEYS, MAPS};
+
+/// The result of applying another configuration to a running process, as keys that are written with `--set`.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct Reloaded {
+    /// The keys whose new values apply now.
+    pub applied: Vec<String>,
+    /// The keys whose new values apply after a restart.
+    pub later: Vec<String>,
+}
+
+/// The keys that only gateways use, as they begin.
+const OF_GATEWAY: [&str; 14] = [
+    "mts.name",
+    "transport.tcp.listen",
+    "transport.udp.",
+    "transport.quic.",
+    "transport.http.",
+    "transport.https.",
+    "transport.udt.",
+    "discovery.",
+    "security.keys",
+    "security.insecure",
+    "security.loopback",
+    "security.legacy_peers",
+    "contacts.",
+    "platform.",
+];
+
+/// Whether only gateways use this key.
+pub(crate) fn is_of_gateway(key: &str) -> bool {
+    OF_GATEWAY
+        .iter()
+        .any(|beginning| key.starts_with(beginning))
+}
 
 impl Config {
     /// Returns the keys whose values differ, as they are written with `--set`.

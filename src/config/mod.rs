@@ -87,6 +87,8 @@ use std::time::Duration;
 use fipa_mts::dial::Network;
 use fipa_transport::{Kind, Location};
 
+pub use changes::Reloaded;
+pub(crate) use changes::is_of_gateway;
 #[cfg(feature = "net")]
 pub(crate) use check::is_on_loopback;
 pub use effective::{Effective, Setting};

@@ -15,18 +15,21 @@ pub(crate) mod user_dir;
 
 use std::ffi::OsStr;
 use std::fmt;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Weak};
+use std::time::Duration;
 
 use fipa_acl::{Dialect, Message, Performative, Representation};
 use fipa_sds::{Cancellation, Entry, Query, Watch};
 use fipa_transport::log_limit;
+use parking_lot::Mutex;
 use tokio::runtime::Handle;
 
 use self::report::RouteReport;
 use crate::agent::checks::Rules;
 use crate::agent::lock_slot;
 use crate::agent::stated::Introductions;
-use crate::config::Sources;
+use crate::config::{ConfigError, Reloaded, Sources};
 use crate::domain::directory_view::DirectoryView;
 use crate::domain::process::Owner;
 use crate::domain::service::{Role, Service};
@@ -51,7 +54,10 @@ pub struct Domain {
 pub(crate) struct Inner {
     pub(crate) service: Service,
     pub(crate) owner: Owner,
-    pub(crate) deadline: std::time::Duration,
+    /// The configuration that applies now.
+    config: Mutex<Config>,
+    /// Its `mts.deadline` in nanoseconds, which each letter needs.
+    deadline: AtomicU64,
     /// Maximum length of a letter, in bytes.
     pub(crate) max_letter: u64,
     pub(crate) rules: Rules,
@@ -63,6 +69,13 @@ pub(crate) struct Inner {
     pub(crate) introductions: Introductions,
 }
 
+impl Inner {
+    /// Returns the deadline of letters whose sender sets none.
+    pub(crate) fn deadline(&self) -> Duration {
+        Duration::from_nanos(self.deadline.load(Ordering::Relaxed))
+    }
+}
+
 impl Drop for Inner {
     fn drop(&mut self) {
         // In a forked child, everything still belongs to the parent.
@@ -72,11 +85,39 @@ impl Drop for Inner {
     }
 }
 
+impl fmt::Debug for Inner {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Inner").finish_non_exhaustive()
+    }
+}
+
 impl fmt::Debug for Domain {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Domain")
             .field("mts", &self.inner.service.own)
             .finish_non_exhaustive()
+    }
+}
+
+/// Reads the configuration of a domain again, from the sources that the program has given.
+#[derive(Debug, Clone)]
+pub struct Follower {
+    domain: Weak<Inner>,
+    sources: Arc<Sources>,
+}
+
+impl Follower {
+    /// Reads the configuration again, and [applies](Domain::reload) it. Returns `None` after the process has left the
+    /// domain.
+    ///
+    /// # Errors
+    /// Fails when the configuration cannot be read or has mistakes; nothing has changed then.
+    #[must_use]
+    pub fn reload(&self) -> Option<Result<Reloaded, ConfigError>> {
+        let inner = self.domain.upgrade()?;
+        let domain = Domain { inner };
+        let config = Config::load(&self.sources);
+        Some(config.and_then(|config| domain.reload(&config)))
     }
 }
 
@@ -92,12 +133,15 @@ pub struct RegisterOptions {
 impl Domain {
     /// Joins the domain of the configuration that the environment of this process selects: the file
     /// named by `$FIPA_CONFIG`, else `./fipa.toml`, else `~/.config/fipa/fipa.toml`, else the defaults.
-    /// See [`open`](Self::open).
+    /// See [`open`](Self::open). The process [follows](Self::follow) the configuration.
     ///
     /// # Errors
     /// If the file cannot be read or has mistakes, or as for [`open`](Self::open).
     pub async fn from_environment() -> Result<Self, OpenError> {
-        Self::open(&Config::load(&Sources::from_environment())?).await
+        let sources = Sources::from_environment();
+        let domain = Self::open(&Config::load(&sources)?).await?;
+        domain.follow(sources);
+        Ok(domain)
     }
 
     /// Joins the domain that the configuration names. Must be called within a tokio runtime, which
@@ -157,12 +201,12 @@ impl Domain {
             },
             cancellation,
         )?;
-        let deadline = config.mts.deadline;
         Ok(Self {
             inner: Arc::new(Inner {
                 service,
                 owner: Owner::this(),
-                deadline,
+                config: Mutex::new(config.clone()),
+                deadline: AtomicU64::new(nanoseconds(config.mts.deadline)),
                 max_letter: config.transport.shm.max_letter,
                 rules,
                 locking: lock_slot::Neighbors::default(),
@@ -234,6 +278,49 @@ impl Domain {
         self.inner.service.report(&entries)
     }
 
+    /// Applies another configuration without losing a letter. The order of the transports, the exceptions from it, the
+    /// deadline of letters and the access rules take effect at once, also for letters that wait. The other keys take
+    /// effect when the process joins the domain again. Keys that only gateways use are not in the result.
+    ///
+    /// # Errors
+    /// Fails when the configuration has mistakes; nothing has changed then.
+    pub fn reload(&self, config: &Config) -> Result<Reloaded, ConfigError> {
+        config.check()?;
+        let mut current = self.inner.config.lock();
+        let reloaded = self.inner.service.reload(&mut current, config);
+        let deadline = nanoseconds(current.mts.deadline);
+        self.inner.deadline.store(deadline, Ordering::Relaxed);
+        Ok(reloaded)
+    }
+
+    /// Reads the configuration from these sources again whenever `fipa reload` requests it, and
+    /// [applies](Self::reload) it, as long as the process takes part in the domain. A call replaces the sources of
+    /// the previous one. With the result, the program reads it at other times, for example after SIGHUP.
+    pub fn follow(&self, sources: Sources) -> Follower {
+        let mut requests = self.inner.service.reload_requests();
+        let follower = Follower {
+            domain: Arc::downgrade(&self.inner),
+            sources: Arc::new(sources),
+        };
+        let following = follower.clone();
+        self.inner.service.runtime.spawn(async move {
+            while let Some(request) = requests.next().await {
+                let Some(reloaded) = following.reload() else {
+                    return;
+                };
+                if let Ok(reloaded) = &reloaded {
+                    log_limit::info!(
+                        applied = reloaded.applied.join(" "),
+                        after_restart = reloaded.later.join(" "),
+                        "the configuration was read again"
+                    );
+                }
+                request.answer(&reloaded);
+            }
+        });
+        follower
+    }
+
     /// Leaves the domain. Waits up to one second for letters in transit, and deregisters all agents of
     /// this process.
     pub async fn close(self) {
@@ -242,6 +329,10 @@ impl Domain {
         }
         self.inner.service.close().await;
     }
+}
+
+fn nanoseconds(deadline: Duration) -> u64 {
+    u64::try_from(deadline.as_nanos()).unwrap_or(u64::MAX)
 }
 
 /// Returns the name of the message transport service of a process on the host with this name.

@@ -17,7 +17,9 @@ use tokio::task::JoinHandle;
 use crate::Config;
 use crate::access::gate::{Of, RulesGate};
 use crate::admin::open_files;
+use crate::admin::reload::ReloadRequests;
 use crate::admin::watch::Watchers;
+use crate::config::{self, Reloaded};
 use crate::domain::files::DomainDir;
 use crate::domain::maintenance::DirMaintenance;
 use crate::domain::membership::{self, Membership};
@@ -42,6 +44,10 @@ pub(crate) struct Service {
     /// The service in the directory.
     pub(crate) own: fipa_sds::MtsId,
     pub(crate) dir: DomainDir,
+    /// Whether the service is the gateway.
+    gateway: bool,
+    gate: Arc<RulesGate>,
+    watchers: Arc<Watchers>,
     /// The task that serves the watchers.
     watching: JoinHandle<()>,
     maintenance: JoinHandle<()>,
@@ -138,15 +144,19 @@ impl Service {
                 unframed_deadline: config.mts.deadline,
                 contacts: role.contacts.clone(),
                 tap: Some(Arc::clone(&watchers) as Arc<dyn fipa_mts::Tap>),
-                gate,
+                gate: Some(Arc::clone(&gate) as Arc<dyn AccessGate>),
             },
             view,
             transports,
             &handle,
         );
         let connected = watchers.connect_all(&host, &mts);
-        let watching = handle.spawn(watchers.run(Arc::clone(&host), mts.clone(), connected));
+        let running = Arc::clone(&watchers).run(Arc::clone(&host), mts.clone(), connected);
+        let watching = handle.spawn(running);
         let service = Self {
+            watchers,
+            gate,
+            gateway: role.gateway,
             watching,
             locations: mts.locations(),
             maintenance: handle.spawn(maintenance.run()),
@@ -273,14 +283,42 @@ impl Service {
         self.mts.kinds().any(|open| open == kind)
     }
 
-    /// Applies the orders of transports and the deadline of this configuration. For the gateway only.
-    #[cfg(feature = "net")]
-    pub(crate) fn reorder(&self, config: &Config) {
-        let mut order = config.mts.transports.clone();
+    /// Applies the keys of another configuration that every service follows: the order of transports, the
+    /// exceptions from it, the deadline and the access rules. Copies the applied values into `current`.
+    /// Keys that concern only gateways are left out of the result of other processes.
+    pub(crate) fn reload(&self, current: &mut Config, new: &Config) -> Reloaded {
         let open: Vec<Kind> = self.mts.kinds().collect();
-        order.retain(|kind| open.contains(kind));
-        let routes = routes(config, &order, true);
-        self.mts.reorder(order, routes, config.mts.deadline);
+        let all_open = used(new, self.gateway).all(|kind| open.contains(&kind));
+        let mut keys = current.differences(new);
+        keys.retain(|key| self.gateway || !config::is_of_gateway(key));
+        let (applied, later) = keys.into_iter().partition(|key| match key.as_str() {
+            "mts.deadline" | "routes" => true,
+            "mts.transports" => all_open,
+            key => key.starts_with("access."),
+        });
+        let order: Vec<Kind> = used(new, self.gateway)
+            .filter(|kind| open.contains(kind))
+            .collect();
+        let routes = routes(new, &order, self.gateway);
+        self.mts.reorder(order, routes, new.mts.deadline);
+        if current.access != new.access {
+            // Cannot fail, because the check of the configuration has parsed the rules.
+            if let Ok(rules) = new.access.rules() {
+                self.gate.set_rules(rules);
+            }
+        }
+        current.mts.deadline = new.mts.deadline;
+        current.routes.clone_from(&new.routes);
+        current.access.clone_from(&new.access);
+        if all_open {
+            current.mts.transports.clone_from(&new.mts.transports);
+        }
+        Reloaded { applied, later }
+    }
+
+    /// Returns the requests to read the configuration again, which `fipa reload` sends. They go to the latest caller.
+    pub(crate) fn reload_requests(&self) -> ReloadRequests {
+        self.watchers.reload_requests()
     }
 
     /// Waits for letters in transit, at most [`CLOSING_TIMEOUT`], and ends the service.
@@ -319,19 +357,20 @@ fn with_path(location: &Location) -> Location {
     )
 }
 
-/// Creates the access gate, if the configuration has access rules.
+/// Creates the access gate with the rules of the configuration.
 fn gate(
     config: &Config,
     role: &Role<'_>,
     host: &Arc<HostDirectory>,
-) -> Result<Option<Arc<dyn AccessGate>>, OpenError> {
+) -> Result<Arc<RulesGate>, OpenError> {
     let of = match role.gateway {
         true => Of::Gateway(Arc::clone(&role.name)),
         false => Of::Process(Arc::clone(host)),
     };
+    let gate = RulesGate::new(of);
     // Cannot fail, because the check of the configuration has parsed the rules.
-    let access = config.access.rules().map_err(OpenError::Access)?;
-    Ok(access.map(|access| Arc::new(RulesGate::new(access, of)) as Arc<dyn AccessGate>))
+    gate.set_rules(config.access.rules().map_err(OpenError::Access)?);
+    Ok(Arc::new(gate))
 }
 
 /// Joins the reasons why no transport can be used.
@@ -349,7 +388,7 @@ fn reasons(config: &Config, refused: &[(Kind, String)]) -> String {
 }
 
 fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> CoreConfig {
-    let order: Vec<Kind> = used(config, role).collect();
+    let order: Vec<Kind> = used(config, role.gateway).collect();
     CoreConfig {
         forwards: role.gateway,
         routes: routes(config, &order, role.gateway),
@@ -382,8 +421,7 @@ fn routes(config: &Config, order: &[Kind], gateway: bool) -> Vec<RouteException>
 /// Returns the kinds of transport for this role, in order of preference. One configuration serves the
 /// gateway and all other processes of a host. Only the gateway uses the network, unless
 /// `transport.tcp.processes` turns on TCP within the host.
-fn used<'a>(config: &'a Config, role: &Role<'_>) -> impl Iterator<Item = Kind> + use<'a> {
-    let gateway = role.gateway;
+fn used(config: &Config, gateway: bool) -> impl Iterator<Item = Kind> {
     let kinds = config.mts.transports.iter().copied();
     kinds.filter(move |kind| {
         let tcp = *kind == Kind::Tcp && config.transport.tcp.processes;
@@ -405,7 +443,7 @@ impl TransportParts<'_> {
     /// `refused`.
     fn transports(&mut self, refused: &mut Vec<(Kind, String)>) -> Vec<Arc<dyn Transport>> {
         let mut transports: Vec<Arc<dyn Transport>> = Vec::new();
-        for kind in used(self.config, self.role) {
+        for kind in used(self.config, self.role.gateway) {
             let opened = match kind {
                 #[cfg(feature = "shm")]
                 Kind::Shm => self.shm(),

@@ -33,7 +33,7 @@ use fipa_sds::{
     RegisterError, Registration, Role as EntryRole, StaticDirectory, reserved_for,
 };
 use fipa_transport::{
-    Incarnation, Introduction, Kind, Location, Signature, TransportErrorKind, log_limit,
+    Incarnation, Introduction, Location, Signature, TransportErrorKind, log_limit,
 };
 use fipa_transport_net::{Refusals, RefusedDials};
 use parking_lot::Mutex;
@@ -56,7 +56,8 @@ use self::platform_agents::PlatformAgents;
 #[cfg(feature = "fuzzing")]
 pub(crate) use self::state::play as play_state;
 use self::state::{Predecessor, StateFile, Trust};
-use crate::config::ConfigError;
+use crate::admin::reload::ReloadRequests;
+use crate::config::{ConfigError, Reloaded};
 use crate::domain::background;
 use crate::domain::directory_view::DirectoryView;
 use crate::domain::process::Owner;
@@ -340,17 +341,15 @@ impl Gateway {
         self.neighbors.all()
     }
 
-    /// Applies another configuration without losing a letter. The orders of transports, the
-    /// exceptions from them, the deadline of letters from legacy peers, and the static peers take
-    /// effect at once. Returns the keys that differ and take effect only after a restart of the
-    /// gateway.
+    /// Applies another configuration without losing a letter. The order of transports, the exceptions from it, the
+    /// deadline of letters from legacy peers, the access rules and the static peers take effect at once. The other
+    /// keys take effect after a restart of the gateway.
     ///
     /// # Errors
     /// Fails when the configuration has mistakes; nothing has changed then.
-    pub fn reload(&mut self, config: &Config) -> Result<Vec<String>, ConfigError> {
+    pub fn reload(&mut self, config: &Config) -> Result<Reloaded, ConfigError> {
         config.check()?;
-        let mut later = self.config.differences(config);
-        let open: Vec<Kind> = self.service.mts.kinds().collect();
+        let mut reloaded = self.service.reload(&mut self.config, config);
         let agents = |config: &Config| {
             let peers = config.discovery.peers.iter();
             peers
@@ -358,37 +357,28 @@ impl Gateway {
                 .cloned()
                 .collect::<Vec<_>>()
         };
-        let same_agents = agents(&self.config) == agents(config);
-        later.retain(|key| match key.as_str() {
-            "mts.deadline" | "routes" => false,
-            "discovery.static" => !same_agents,
-            "mts.transports" => config
-                .mts
-                .transports
-                .iter()
-                .any(|kind| !open.contains(kind)),
-            _ => true,
-        });
-        self.service.reorder(config);
-        let peers = static_peers(config);
-        self.neighbors.name_peers(peers.clone());
-        self.service.mts.keep_in_touch(peers);
-        self.config.mts.deadline = config.mts.deadline;
-        self.config.routes.clone_from(&config.routes);
-        if same_agents {
+        if agents(&self.config) == agents(config) {
+            let peers = reloaded
+                .later
+                .extract_if(.., |key| key == "discovery.static");
+            reloaded.applied.extend(peers);
             self.config
                 .discovery
                 .peers
                 .clone_from(&config.discovery.peers);
         }
-        if !later.iter().any(|key| key == "mts.transports") {
-            self.config
-                .mts
-                .transports
-                .clone_from(&config.mts.transports);
-        }
+        let peers = static_peers(config);
+        self.neighbors.name_peers(peers.clone());
+        self.service.mts.keep_in_touch(peers);
         *self.configuration.lock() = self.config.values();
-        Ok(later)
+        Ok(reloaded)
+    }
+
+    /// Returns the requests of `fipa reload` to this gateway, which its program answers after it has
+    /// [reloaded](Self::reload) the configuration. They go to the latest caller of this function.
+    #[must_use]
+    pub fn reload_requests(&self) -> ReloadRequests {
+        self.service.reload_requests()
     }
 
     /// Returns the current problem of the discovery of other hosts, if there is one, and its changes.

@@ -156,7 +156,7 @@ pub(super) fn answer(core: &AgentCore, shared: &Shared, question: &Message) {
         .map_err(|error| error.to_string())
         .and_then(|answer| {
             let letter = letter_for(&answer, SystemTime::now());
-            let sending = endpoint.send(&answer, letter, endpoint.domain.inner.deadline);
+            let sending = endpoint.send(&answer, letter, endpoint.domain.inner.deadline());
             sending
                 .map(drop)
                 .map_err(|error| ErrorChain(&error).to_string())

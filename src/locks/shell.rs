@@ -361,7 +361,7 @@ impl Shared {
                 let message = codec::encode(message, self.algorithm, &endpoint.id, &receiver);
                 let message = message.map_err(|error| error.to_string())?;
                 let letter = letter_for(&message, SystemTime::now());
-                let mut deadline = endpoint.domain.inner.deadline;
+                let mut deadline = endpoint.domain.inner.deadline();
                 if !algorithm.is_extended() {
                     deadline = deadline.max(UNREPEATED);
                 }

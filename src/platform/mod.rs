@@ -434,7 +434,7 @@ impl Server {
 
     /// Returns the time for an answer: the deadlines of the request and of the answer.
     fn timeout(&self) -> Duration {
-        self.core.endpoint.domain.inner.deadline * 2
+        self.core.endpoint.domain.inner.deadline() * 2
     }
 
     fn message(

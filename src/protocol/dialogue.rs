@@ -643,7 +643,7 @@ impl Speaker {
         mut message: MessageBuilder,
         due: Option<Instant>,
     ) -> Result<Sent, DialogueError> {
-        let mut deadline = self.core.endpoint.domain.inner.deadline;
+        let mut deadline = self.core.endpoint.domain.inner.deadline();
         if let Some(due) = due {
             let left = due.saturating_duration_since(Instant::now());
             deadline = deadline.min(left);

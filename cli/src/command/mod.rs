@@ -25,6 +25,7 @@ mod own;
 mod ping;
 mod protocol;
 mod publish;
+mod reload;
 mod request;
 mod routes;
 mod send;
@@ -61,6 +62,7 @@ pub(crate) enum Command {
     Lock(lock::Arguments),
     Locks(locks::Arguments),
     Routes(routes::Arguments),
+    Reload(reload::Arguments),
     Watch(Box<watch::Arguments>),
     Demo(demo::Arguments),
     Doctor(doctor::Arguments),
@@ -101,6 +103,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Lock(arguments) => lock::run(arguments, global),
         Command::Locks(arguments) => locks::run(arguments, global),
         Command::Routes(arguments) => routes::run(arguments, global),
+        Command::Reload(arguments) => reload::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
         Command::Doctor(arguments) => doctor::run(arguments, global),

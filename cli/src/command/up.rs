@@ -2,6 +2,7 @@
 
 use clap::Args;
 use fipa::admin::keys::{Certificate, Keys};
+use fipa::config::{ConfigError, Reloaded};
 use fipa::{Change, Config, Entry, Gateway, Reach, log_limit};
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
@@ -9,7 +10,7 @@ use serde_json::{Value, json};
 use crate::membership::{self, SignalRequest, Stop};
 use crate::options::{self, Global};
 use crate::output;
-use crate::report::{self, Failure};
+use crate::report::Failure;
 
 /// Run the gateway, which connects the agents of this host with agents on other hosts
 ///
@@ -17,8 +18,8 @@ use crate::report::{self, Failure};
 /// mDNS and discovers the agents of other hosts, until Ctrl-C. Agents of one host reach each other
 /// without it. A domain has at most one gateway on a host.
 ///
-/// On SIGHUP (`kill -HUP`) the gateway reads its configuration again and loses no letter. It applies
-/// the order of mts.transports, mts.deadline, [routes] and discovery.static, and warns about changes
+/// On `fipa reload` and SIGHUP (`kill -HUP`) the gateway reads its configuration again and loses no letter. It applies
+/// the order of mts.transports, mts.deadline, [routes], [access] and discovery.static, and warns about changes
 /// that take effect only after a restart.
 ///
 /// The command prints the gateway's name and addresses on standard output. With -v it logs on
@@ -56,6 +57,7 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
     let mut problems = gateway.discovery_problem();
     let mut problem = problems.borrow_and_update().clone();
     let mut changes = gateway.directory().watch();
+    let mut reloads = gateway.reload_requests();
     if json {
         output::json_line(&ready_json(config, &gateway, problem.as_deref()))?;
     } else {
@@ -68,8 +70,15 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
         tokio::select! {
             request = stop.next_request() => match request {
                 SignalRequest::End => break,
-                SignalRequest::Reload => reload(&mut gateway, global),
+                SignalRequest::Reload => {
+                    membership::report_reload(&reload(&mut gateway, global));
+                }
             },
+            Some(request) = reloads.next() => {
+                let reloaded = reload(&mut gateway, global);
+                membership::report_reload(&reloaded);
+                request.answer(&reloaded);
+            }
             Some(change) = changes.next() => log(&change),
             Ok(()) = problems.changed() => {
                 let now = problems.borrow_and_update().clone();
@@ -89,25 +98,9 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
     Ok(())
 }
 
-/// Reloads the configuration. An invalid configuration changes nothing.
-fn reload(gateway: &mut Gateway, global: &Global) {
-    let reloaded = global.config().and_then(|config| {
-        let later = gateway.reload(&config)?;
-        Ok(later)
-    });
-    match reloaded {
-        Ok(later) => {
-            log_limit::info!("configuration reloaded");
-            if !later.is_empty() {
-                let later = later.join(", ");
-                report::warn(&format!(
-                    "changes to {later} take effect when the gateway is restarted"
-                ));
-            }
-        }
-        // The gateway continues with its previous configuration.
-        Err(failure) => drop(failure.report()),
-    }
+/// Reads the configuration again, and applies it. An invalid configuration changes nothing.
+fn reload(gateway: &mut Gateway, global: &Global) -> Result<Reloaded, ConfigError> {
+    gateway.reload(&global.effective()?.into_config())
 }
 
 fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {

@@ -27,7 +27,7 @@ impl Core {
 
     /// Handles a parcel whose letter the [reader](Self::reader) of this core has
     /// [read](super::LetterReader::read_arrival) before the core was locked. A gateway refuses a letter that
-    /// was not read, and so does a core with a gate.
+    /// was not read. With a gate, a letter that was not read is read here.
     pub fn handle_read_arrival(
         &mut self,
         now: Now,
@@ -93,6 +93,7 @@ impl Core {
         (letter, read): (Letter, Option<Box<ReadLetter>>),
     ) -> Reaction {
         let ArrivalLink { via, from, ticket } = link;
+        let read = self.reader.completed(read, &letter, from.is_remote());
         if let Err(refusal) = self.check_letter(label, &from, &letter, read.as_deref()) {
             return Reaction::Now(refusal);
         }
@@ -105,7 +106,7 @@ impl Core {
         };
         let seen = self.table.watched.then(|| letter.clone());
         let parts = read.as_ref().and_then(|read| read.parts.as_ref());
-        let gate = self.reader.gate.as_deref().map(|gate| (gate, parts));
+        let gate = self.reader.gate().map(|gate| (gate, parts));
         let answer = inbox.accept(now.instant, label, letter, (via, &from), gate);
         if answer == Answer::Accepted {
             if let Some(letter) = seen {
@@ -253,8 +254,8 @@ impl Core {
         parts: Option<&LetterParts>,
         link: Link,
     ) -> Result<(), String> {
-        match &self.reader.gate {
-            Some(gate) => ask(&**gate, now.instant, receiver, parts, link),
+        match self.reader.gate() {
+            Some(gate) => ask(gate, now.instant, receiver, parts, link),
             None => Ok(()),
         }
     }

@@ -112,3 +112,28 @@ impl CoreConfig {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_exception_for_this_host_leaves_the_order_to_other_hosts() {
+        let exception = |receivers: &str, only_on_this_host| RouteException {
+            receivers: Pattern::new(receivers).unwrap(),
+            order: vec![Kind::Tcp],
+            only_on_this_host,
+        };
+        let config = CoreConfig {
+            routes: vec![exception("arm", true), exception("a.*", false)],
+            ..CoreConfig::new("mts", Incarnation::from_u64(1), vec![Kind::Shm])
+        };
+        let gateway = Incarnation::from_u64(2);
+        let away = Reach::Remote { gateway };
+        assert_eq!(config.order_for("arm", Reach::Local), [Kind::Tcp]);
+        // The first match counts, also where it leaves the order to the default.
+        assert_eq!(config.order_for("arm", away), [Kind::Shm]);
+        assert_eq!(config.order_for("axe", away), [Kind::Tcp]);
+        assert_eq!(config.order_for("eye", Reach::Local), [Kind::Shm]);
+    }
+}

@@ -213,7 +213,7 @@ impl Core {
     /// Sets the gate that decides which letters are accepted.
     #[must_use]
     pub fn gated(mut self, gate: Arc<dyn AccessGate>) -> Self {
-        self.reader.gate = Some(gate);
+        self.reader.set_gate = Some(gate);
         self
     }
 

@@ -74,7 +74,8 @@ pub struct LetterReader {
     name: Arc<str>,
     incarnation: Incarnation,
     forwards: bool,
-    pub(super) gate: Option<Arc<dyn AccessGate>>,
+    /// The gate, which may be inactive; see [`gate`](Self::gate).
+    pub(super) set_gate: Option<Arc<dyn AccessGate>>,
 }
 
 /// A letter that was read.
@@ -107,7 +108,7 @@ impl LetterReader {
             name: Arc::clone(&config.name),
             incarnation: config.incarnation,
             forwards: config.forwards,
-            gate: None,
+            set_gate: None,
         }
     }
 
@@ -123,7 +124,7 @@ impl LetterReader {
     }
 
     fn read(&self, letter: &Letter, is_remote: bool) -> Option<Box<ReadLetter>> {
-        let is_needed = self.gate.is_some() || self.forwards || is_remote;
+        let is_needed = self.gate().is_some() || self.forwards || is_remote;
         if !is_needed || too_long(letter).is_some() {
             return None;
         }
@@ -141,6 +142,27 @@ impl LetterReader {
 
     /// Has the gate read a letter, if there is one.
     pub(super) fn parts(&self, letter: &Letter) -> Option<LetterParts> {
-        self.gate.as_ref().map(|gate| gate.read(letter))
+        self.gate().map(|gate| gate.read(letter))
+    }
+
+    /// Reads a letter that was read while the gate was inactive again if the gate is active now.
+    #[inline]
+    pub(super) fn completed(
+        &self,
+        read: Option<Box<ReadLetter>>,
+        letter: &Letter,
+        is_remote: bool,
+    ) -> Option<Box<ReadLetter>> {
+        let is_complete = read.as_ref().is_some_and(|read| read.parts.is_some());
+        if is_complete || self.gate().is_none() {
+            return read;
+        }
+        self.read(letter, is_remote)
+    }
+
+    /// Returns the gate while it is active.
+    #[inline]
+    pub(super) fn gate(&self) -> Option<&dyn AccessGate> {
+        self.set_gate.as_deref().filter(|gate| gate.is_active())
     }
 }

@@ -303,9 +303,11 @@ impl Core {
             self.failure_limit.credit(now.instant, from, len);
             if let Some(fault) = &unframed.fault {
                 log_limit::info!(of: quota_address(from), %from, "refused a letter of a legacy peer: {fault}");
-            } else if unframed.parts.is_none() {
-                unframed.parts = self.reader.parts(&unframed.letter);
             }
+        }
+        // The gate may be active only since the previous portion.
+        if unframed.fault.is_none() && unframed.parts.is_none() {
+            unframed.parts = self.reader.parts(&unframed.letter);
         }
         unframed.is_contact = false;
         for _ in 0..UNFRAMED_PORTION {

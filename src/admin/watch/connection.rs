@@ -17,6 +17,8 @@ use tokio::io::Interest;
 use tokio::net::UnixDatagram;
 use tokio::sync::Notify;
 
+use super::reloading::REQUEST;
+
 /// Maximum number of bytes of queued records for one slow watcher.
 const MAX_QUEUED: usize = 1 << 20;
 /// Bytes that a queued record counts in addition to its own.
@@ -25,6 +27,7 @@ const OVERHEAD: usize = 64;
 const PAUSE: Duration = Duration::from_millis(1);
 
 /// The connection to one watcher.
+#[derive(Debug)]
 pub(super) struct Connection {
     socket: UnixDatagram,
     /// Number of bytes of content per message that the watcher requests; 0 until its request arrives.
@@ -34,7 +37,7 @@ pub(super) struct Connection {
     wake: Notify,
 }
 
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Outgoing {
     queued: VecDeque<Vec<u8>>,
     bytes: usize,
@@ -68,20 +71,36 @@ impl Connection {
             return;
         }
         record::set_lost(&mut bytes, outgoing.lost);
-        if outgoing.queued.is_empty() && self.try_send(&mut outgoing, &bytes) {
-            outgoing.reported = outgoing.lost;
-            return;
+        let lost = outgoing.lost;
+        if self.send_or_queue(&mut outgoing, bytes) {
+            outgoing.reported = lost;
+        }
+    }
+
+    /// Sends or queues an answer to a request, which is no record.
+    pub(super) fn send_answer(&self, bytes: Vec<u8>) {
+        let mut outgoing = self.outgoing.lock();
+        if !outgoing.disconnected {
+            self.send_or_queue(&mut outgoing, bytes);
+        }
+    }
+
+    /// Returns whether the bytes were sent at once.
+    fn send_or_queue(&self, outgoing: &mut Outgoing, bytes: Vec<u8>) -> bool {
+        if outgoing.queued.is_empty() && self.try_send(outgoing, &bytes) {
+            return true;
         }
         let size = bytes.len() + OVERHEAD;
         if outgoing.bytes + size > MAX_QUEUED {
             outgoing.lost += 1;
-            return;
+            return false;
         }
         if outgoing.queued.is_empty() {
             self.wake.notify_one();
         }
         outgoing.bytes += size;
         outgoing.queued.push_back(bytes);
+        false
     }
 
     /// Tries to send a record. Returns whether it is done: sent, or dropped because the watcher has
@@ -138,13 +157,14 @@ impl Connection {
         self.outgoing.lock().disconnected
     }
 
-    /// Sends queued records whenever the socket accepts them, until the watcher disconnects.
-    pub(super) async fn serve(&self) {
+    /// Sends queued records whenever the socket accepts them, until the watcher disconnects. Calls `reload` when the
+    /// watcher requests that the process read its configuration again.
+    pub(super) async fn serve(&self, reload: impl Fn()) {
         while !self.is_disconnected() {
             let waiting = self.has_records();
             tokio::select! {
                 () = self.wake.notified() => {}
-                () = self.read_requests() => return,
+                () = self.read_requests(&reload) => return,
                 ready = self.socket.writable(), if waiting => match ready {
                     Ok(()) if !self.flush() => tokio::time::sleep(PAUSE).await,
                     Ok(()) => {}
@@ -155,11 +175,13 @@ impl Connection {
     }
 
     /// Receives the requests of the watcher, until it disconnects or sends an invalid one.
-    async fn read_requests(&self) {
+    async fn read_requests(&self, reload: &impl Fn()) {
         let mut buffer = [0; Wish::LEN + 1];
         while let Ok(len) = self.socket.recv(&mut buffer).await {
-            match buffer.get(..len).and_then(Wish::parse) {
+            let request = buffer.get(..len).unwrap_or_default();
+            match Wish::parse(request) {
                 Some(wish) => self.content.store(wish.content, Ordering::Relaxed),
+                None if request == REQUEST => reload(),
                 None => return,
             }
         }

@@ -11,7 +11,8 @@
 
 mod connection;
 mod listener;
-mod socket;
+pub(crate) mod reloading;
+pub(crate) mod socket;
 mod watchers;
 
 use std::collections::HashSet;

@@ -10,16 +10,16 @@ use std::os::fd::OwnedFd;
 use tokio::net::{UnixDatagram, UnixListener, UnixStream};
 
 /// Registers a connected socket with the runtime.
-pub(super) fn connected(socket: OwnedFd) -> io::Result<UnixDatagram> {
+pub(crate) fn connected(socket: OwnedFd) -> io::Result<UnixDatagram> {
     UnixDatagram::from_std(socket.into())
 }
 
 /// Registers a listening socket with the runtime.
-pub(super) fn listening(socket: OwnedFd) -> io::Result<UnixListener> {
+pub(crate) fn listening(socket: OwnedFd) -> io::Result<UnixListener> {
     UnixListener::from_std(socket.into())
 }
 
 /// Registers a socket that the listener accepted with the runtime.
-pub(super) fn accepted(socket: UnixStream) -> io::Result<UnixDatagram> {
+pub(crate) fn accepted(socket: UnixStream) -> io::Result<UnixDatagram> {
     connected(socket.into_std()?.into())
 }

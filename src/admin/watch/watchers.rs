@@ -11,9 +11,11 @@ use fipa_sds::{HostDirectory, HostError, SocketId};
 use fipa_transport::log_limit;
 use parking_lot::Mutex;
 use rustix::net::sockopt::set_socket_send_buffer_size;
+use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 use super::connection::Connection;
+use super::reloading::{ReloadRequest, ReloadRequests};
 use super::socket;
 
 /// Maximum number of watchers that get records.
@@ -33,6 +35,8 @@ pub(crate) struct Watchers {
     /// Serializes changes of `connections`, so that the service is watched exactly while there is a
     /// connection. A separate lock, because `connections` is locked while the service is locked.
     changing: Mutex<()>,
+    /// Receives the requests to read the configuration again.
+    reloads: Mutex<Option<mpsc::Sender<ReloadRequest>>>,
 }
 
 impl Tap for Watchers {
@@ -51,7 +55,15 @@ impl Watchers {
             gateway,
             connections: Mutex::default(),
             changing: Mutex::default(),
+            reloads: Mutex::default(),
         }
+    }
+
+    /// Returns the requests to read the configuration again, from now on.
+    pub(crate) fn reload_requests(&self) -> ReloadRequests {
+        let (sender, requests) = ReloadRequests::new();
+        *self.reloads.lock() = Some(sender);
+        requests
     }
 
     /// Connects to the running watchers, so that they get a record of the first letter: a process may
@@ -160,7 +172,14 @@ pub(crate) struct Connected {
 
 impl Connected {
     async fn serve(self) {
-        self.connection.serve().await;
+        let reload = || {
+            let request = ReloadRequest::new(Arc::clone(&self.connection));
+            if let Some(reloads) = &*self.watchers.reloads.lock() {
+                // A request that is not taken is dropped, which answers it.
+                let _ = reloads.try_send(request);
+            }
+        };
+        self.connection.serve(reload).await;
     }
 
     fn change(&self, change: impl FnOnce(&mut Vec<Arc<Connection>>)) {
