@@ -14,17 +14,17 @@ use fipa_mts::watch::Record;
 use fipa_mts::watch::record::{MAX_LEN, RecordBody};
 use fipa_sds::{Cancellation, Directory, HostDirectory, Reach};
 use fipa_transport::{Incarnation, log_limit};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use tokio::net::{UnixDatagram, UnixListener, UnixStream};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout, timeout_at};
 
 use crate::Config;
-use crate::admin::watch::reloading::{REQUEST, read_answer};
-pub use crate::admin::watch::reloading::{ReloadRequest, ReloadRequests};
+use crate::admin::watch::connection::RELOAD;
+use crate::admin::watch::reloading::read_answer;
+pub use crate::admin::watch::reloading::{ReloadAnswer, ReloadRequest, ReloadRequests};
 use crate::admin::watch::socket;
-use crate::config::Reloaded;
 use crate::domain::files::DomainDir;
 use crate::domain::membership::{self, Membership};
 use crate::error::OpenError;
@@ -35,24 +35,6 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 const SETTLE_TIME: Duration = Duration::from_millis(100);
 /// Maximum number of processes that are asked.
 const MAX_PROCESSES: usize = 1024;
-
-/// The answer of a process to a request to read its configuration again.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(tag = "result", rename_all = "snake_case")]
-#[non_exhaustive]
-pub enum ReloadAnswer {
-    /// It has applied the configuration.
-    Reloaded(Reloaded),
-    /// It has read a configuration with mistakes, and applied nothing.
-    Refused {
-        /// The mistakes.
-        error: String,
-    },
-    /// It does not follow a configuration file, so it must be restarted.
-    NotFollowed,
-    /// It did not answer in time.
-    Silent,
-}
 
 /// A process that was asked to read its configuration again.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -205,7 +187,7 @@ async fn ask(process: UnixStream, progress: mpsc::Sender<Progress>) -> Option<()
         gateway,
     };
     progress.send(Progress::Asked(asked)).await.ok()?;
-    process.send(&REQUEST).await.ok()?;
+    process.send(&RELOAD).await.ok()?;
     // The process also sends records of letters.
     let answer = loop {
         let bytes = receive(&process, &mut buffer).await?;

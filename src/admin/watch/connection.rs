@@ -17,7 +17,8 @@ use tokio::io::Interest;
 use tokio::net::UnixDatagram;
 use tokio::sync::Notify;
 
-use super::reloading::REQUEST;
+/// A request to read the configuration again. Answers begin with it.
+pub(crate) const RELOAD: [u8; 5] = *b"fipr\x01";
 
 /// Maximum number of bytes of queued records for one slow watcher.
 const MAX_QUEUED: usize = 1 << 20;
@@ -181,7 +182,7 @@ impl Connection {
             let request = buffer.get(..len).unwrap_or_default();
             match Wish::parse(request) {
                 Some(wish) => self.content.store(wish.content, Ordering::Relaxed),
-                None if request == REQUEST => reload(),
+                None if request == RELOAD => reload(),
                 None => return,
             }
         }

@@ -9,7 +9,7 @@
 //!
 //! Not in this module: the format of the records and how they are joined (`fipa_mts::watch`).
 
-mod connection;
+pub(crate) mod connection;
 mod listener;
 pub(crate) mod reloading;
 pub(crate) mod socket;

@@ -4,17 +4,32 @@
 use std::sync::Arc;
 
 use fipa_transport::log_limit::Cut;
+use serde::{Deserialize, Serialize};
 use tokio::sync::mpsc;
 
-use super::connection::Connection;
-use crate::admin::reload::ReloadAnswer;
+use super::connection::{Connection, RELOAD};
 use crate::config::{ConfigError, Reloaded};
-
-/// The request, a datagram to a process. Answers begin with it.
-pub(crate) const REQUEST: [u8; 5] = *b"fipr\x01";
 
 /// Maximum number of requests that wait to be answered. Further ones are answered as not followed.
 const MAX_REQUESTS: usize = 16;
+
+/// The answer of a process to a request to read its configuration again.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "result", rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum ReloadAnswer {
+    /// It has applied the configuration.
+    Reloaded(Reloaded),
+    /// It has read a configuration with mistakes, and applied nothing.
+    Refused {
+        /// The mistakes.
+        error: String,
+    },
+    /// It does not follow a configuration file, so it must be restarted.
+    NotFollowed,
+    /// It did not answer in time.
+    Silent,
+}
 
 /// The requests of `fipa reload` to this process.
 #[derive(Debug)]
@@ -73,7 +88,7 @@ impl Drop for ReloadRequest {
 }
 
 fn written(answer: &ReloadAnswer) -> Vec<u8> {
-    let mut bytes = REQUEST.to_vec();
+    let mut bytes = RELOAD.to_vec();
     // Texts and lists of them are always representable.
     bytes.extend(serde_json::to_vec(answer).unwrap_or_default());
     bytes
@@ -81,7 +96,7 @@ fn written(answer: &ReloadAnswer) -> Vec<u8> {
 
 /// Reads the answer of a process; `None` if the datagram is no answer.
 pub(crate) fn read_answer(bytes: &[u8]) -> Option<ReloadAnswer> {
-    serde_json::from_slice(bytes.strip_prefix(&REQUEST)?).ok()
+    serde_json::from_slice(bytes.strip_prefix(&RELOAD)?).ok()
 }
 
 #[cfg(test)]
