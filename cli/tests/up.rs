@@ -8,7 +8,7 @@ use std::net::TcpListener;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use common::Host;
+use common::{Host, Running};
 use serde_json::{Value, json};
 
 #[test]
@@ -379,4 +379,25 @@ fn a_second_signal_ends_a_command_that_waits_for_the_directory_lock() {
         echo.send_signal("-INT");
     }
     assert_eq!(echo.end().0, Some(1));
+}
+
+#[test]
+fn a_program_logs_its_events_at_the_level_info() {
+    let host = Host::new();
+    let _arm = host.echo("arm_1");
+    let mut command = host.command(&["listen", "rover"]);
+    command.env("RUST_LOG", "info");
+    let mut rover = Running::new(command);
+    rover.wait_for_log(&["INFO", "present", "name=arm_1"]);
+    let eye = host.echo("eye");
+    rover.wait_for_log(&["INFO", "joined", "name=eye"]);
+    eye.send_signal("-KILL");
+    rover.wait_for_log(&["INFO", "left", "name=eye"]);
+
+    // Without a subscriber for these lines, none is written.
+    assert_eq!(rover.signal("-INT").0, Some(0));
+    let mut silent = host.start(&["listen", "rover"]);
+    let _other = host.echo("other");
+    silent.send_signal("-INT");
+    assert_eq!(silent.end(), (Some(0), String::new()));
 }

@@ -1,6 +1,7 @@
 //! The membership of a process in a domain.
 
 pub(crate) mod background;
+pub(crate) mod change_log;
 pub(crate) mod coalition;
 pub(crate) mod directory_view;
 pub(crate) mod files;

@@ -20,6 +20,7 @@ use crate::admin::open_files;
 use crate::admin::reload::ReloadRequests;
 use crate::admin::watch::Watchers;
 use crate::config::{self, Reloaded};
+use crate::domain::change_log;
 use crate::domain::files::DomainDir;
 use crate::domain::maintenance::DirMaintenance;
 use crate::domain::membership::{self, Membership};
@@ -51,6 +52,8 @@ pub(crate) struct Service {
     /// The task that serves the watchers.
     watching: JoinHandle<()>,
     maintenance: JoinHandle<()>,
+    /// The task that logs changes of the directory, if these lines are logged.
+    changes: Option<JoinHandle<()>>,
     /// The runtime of the background tasks.
     pub(crate) runtime: Handle,
 }
@@ -127,6 +130,7 @@ impl Service {
         let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| dir.leave())?;
         let gate = gate(config, &role, &host).inspect_err(|_| dir.leave())?;
         let watchers = Arc::new(Watchers::new(&own, role.gateway));
+        let changes = change_log::start(&*view, &handle);
         let mut refused = Vec::new();
         let mut maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host));
         let mut parts = TransportParts {
@@ -157,6 +161,7 @@ impl Service {
             watchers,
             gate,
             gateway: role.gateway,
+            changes,
             watching,
             locations: mts.locations(),
             maintenance: handle.spawn(maintenance.run()),
@@ -332,6 +337,9 @@ impl Service {
     pub(crate) fn abort(&self) {
         self.watching.abort();
         self.maintenance.abort();
+        if let Some(changes) = &self.changes {
+            changes.abort();
+        }
         self.mts.abort();
         if let Err(error) = self.host.close() {
             log_limit::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");

@@ -242,7 +242,10 @@ impl State {
                 resource,
                 failure,
             } => self.ended(claim, ClaimState::Failed { resource, failure }),
-            Event::Lost { claim, resource } => self.ended(claim, ClaimState::Lost { resource }),
+            Event::Lost { claim, resource } => {
+                log_limit::info!(of: resource.as_str(), resource = %escape(resource.as_str()), "a lock is lost");
+                self.ended(claim, ClaimState::Lost { resource });
+            }
             Event::Owning { resource } => self.holds(&resource, Holding::Owner),
             Event::OwningRefused { resource, by } => {
                 self.holds(&resource, Holding::Refused(by.name().to_owned()));

@@ -102,6 +102,9 @@ impl PartnerWatch {
             self.read_answers();
             let now = Instant::now();
             if let Some(event) = self.partners.poll_event(now) {
+                if let PartnerEvent::Gone { agent } = &event {
+                    log_limit::info!(of: agent, agent = %escape_name(agent), "a partner of a conversation is gone");
+                }
                 return event;
             }
             let asked = self.partners.poll_question(now);

@@ -3,7 +3,7 @@
 use clap::Args;
 use fipa::admin::keys::{Certificate, Keys};
 use fipa::config::{ConfigError, Reloaded};
-use fipa::{Change, Config, Entry, Gateway, Reach, log_limit};
+use fipa::{Config, Gateway, log_limit};
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
 
@@ -56,15 +56,11 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
     let mut gateway = opened.map_err(|error| membership::not_joined(error, config))?;
     let mut problems = gateway.discovery_problem();
     let mut problem = problems.borrow_and_update().clone();
-    let mut changes = gateway.directory().watch();
     let mut reloads = gateway.reload_requests();
     if json {
         output::json_line(&ready_json(config, &gateway, problem.as_deref()))?;
     } else {
         output::text(&ready(config, &gateway, problem.as_deref()))?;
-    }
-    for entry in gateway.directory().entries().iter() {
-        log_entry("present", entry);
     }
     loop {
         tokio::select! {
@@ -79,7 +75,6 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
                 membership::report_reload(&reloaded);
                 request.answer(&reloaded);
             }
-            Some(change) = changes.next() => log(&change),
             Ok(()) = problems.changed() => {
                 let now = problems.borrow_and_update().clone();
                 if now != problem {
@@ -178,27 +173,4 @@ fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Valu
             })).collect::<Vec<_>>(),
         },
     })
-}
-
-fn log(change: &Change) {
-    match change {
-        Change::Together(changes) => changes.iter().for_each(log),
-        Change::Joined(entry) => log_entry("joined", entry),
-        Change::Changed { after, .. } => log_entry("changed", after),
-        Change::Left(entry) => log_entry("left", entry),
-        Change::Lagged => log_limit::info!("some changes are not listed: too many at once"),
-    }
-}
-
-fn log_entry(change: &str, entry: &Entry) {
-    let reach = match entry.reach {
-        Reach::Local => "this host",
-        Reach::Remote { .. } => "another host",
-    };
-    log_limit::info!(
-        of: &*entry.name, name = %entry.name,
-        reach,
-        mts = entry.mts.shown(),
-        "{change}"
-    );
 }
