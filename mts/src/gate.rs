@@ -75,7 +75,8 @@ pub struct LetterParts {
 
 /// Decides which letters are accepted, for an agent of this service or into a gateway's custody.
 pub trait AccessGate: Send + Sync {
-    /// Whether the gate decides at present. While it does not, letters are neither read for it nor judged.
+    /// Whether the gate decides at present. While it does not, letters are neither read for it nor judged. Becomes true
+    /// only while no letter is handled; see [`Mts::reorder`](crate::Mts::reorder).
     fn is_active(&self) -> bool {
         true
     }

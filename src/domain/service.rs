@@ -305,13 +305,13 @@ impl Service {
             .filter(|kind| open.contains(kind))
             .collect();
         let routes = routes(new, &order, self.gateway);
-        self.mts.reorder(order, routes, new.mts.deadline);
-        if current.access != new.access {
-            // Cannot fail, because the check of the configuration has parsed the rules.
-            if let Ok(rules) = new.access.rules() {
+        // Always parsed, because the check of the configuration has parsed the rules.
+        let rules = (current.access != new.access).then(|| new.access.rules());
+        self.mts.reorder(order, routes, new.mts.deadline, || {
+            if let Some(Ok(rules)) = rules {
                 self.gate.set_rules(rules);
             }
-        }
+        });
         current.mts.deadline = new.mts.deadline;
         current.routes.clone_from(&new.routes);
         current.access.clone_from(&new.access);

@@ -166,3 +166,54 @@ impl LetterReader {
         self.set_gate.as_deref().filter(|gate| gate.is_active())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicBool, Ordering};
+    use std::time::{Instant, SystemTime};
+
+    use fipa_acl::{AgentId, Performative};
+
+    use super::*;
+    use crate::Link;
+
+    struct Switched(AtomicBool);
+
+    impl AccessGate for Switched {
+        fn is_active(&self) -> bool {
+            self.0.load(Ordering::Relaxed)
+        }
+
+        fn read(&self, _letter: &Letter) -> LetterParts {
+            LetterParts::default()
+        }
+
+        fn admits(
+            &self,
+            _now: Instant,
+            _receiver: &str,
+            _letter: &LetterParts,
+            _link: Link,
+        ) -> Result<(), String> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_letter_that_was_read_without_an_active_gate_is_read_again() {
+        let gate = Arc::new(Switched(AtomicBool::new(false)));
+        let config = CoreConfig::new("mts", Incarnation::from_u64(1), Vec::new());
+        let mut reader = LetterReader::new(&config);
+        reader.set_gate = Some(Arc::clone(&gate) as Arc<dyn AccessGate>);
+        let agent = |name| AgentId::new(name).unwrap();
+        let message = Message::builder(Performative::Inform)
+            .sender(agent("rover"))
+            .receiver(agent("arm"));
+        let letter = crate::letter_for(&message.build().unwrap(), SystemTime::UNIX_EPOCH).unwrap();
+        assert!(reader.read(&letter, false).is_none());
+        assert!(reader.completed(None, &letter, false).is_none());
+        gate.0.store(true, Ordering::Relaxed);
+        let read = reader.completed(None, &letter, false).unwrap();
+        assert!(read.parts.is_some());
+    }
+}

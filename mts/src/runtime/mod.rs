@@ -473,14 +473,17 @@ impl Mts {
     }
 
     /// Replaces the orders of transports and the deadline of legacy peers' letters; see
-    /// [`Core::reorder`]. No letter is lost.
+    /// [`Core::reorder`]. No letter is lost. `change_gate` is called while no letter is handled, so that each letter is
+    /// handled under the rules of one time. It must not block.
     pub fn reorder(
         &self,
         order: Vec<Kind>,
         routes: Vec<RouteException>,
         unframed_deadline: Duration,
+        change_gate: impl FnOnce(),
     ) {
         let mut state = self.shared.lock();
+        change_gate();
         state.unframed_deadline = unframed_deadline;
         let now = state.clocks.now();
         state.core.reorder(now, order, routes);
