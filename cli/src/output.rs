@@ -5,6 +5,7 @@
 use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal, Write};
+use std::time::Duration;
 
 use comfy_table::{Cell, ContentArrangement, Table, presets};
 use fipa::{Deliveries, Outcome};
@@ -55,6 +56,29 @@ pub(crate) fn mermaid(text: &str) -> String {
 /// long cells continue in further lines.
 pub(crate) fn table<T: Into<Cell>>(columns: impl IntoIterator<Item = T>) -> Table {
     table_within(columns, terminal_width())
+}
+
+/// Keeps each row of a table on one line of a terminal: what does not fit is cut.
+pub(crate) fn cut_to_lines(table: &mut Table) {
+    for row in table.row_iter_mut() {
+        row.max_height(1);
+    }
+}
+
+/// The two largest units of a time, for table cells.
+pub(crate) fn time_span(time: Duration) -> String {
+    let seconds = time.as_secs();
+    match (
+        seconds / 86_400,
+        seconds / 3600 % 24,
+        seconds / 60 % 60,
+        seconds % 60,
+    ) {
+        (0, 0, 0, seconds) => format!("{seconds}s"),
+        (0, 0, minutes, seconds) => format!("{minutes}m {seconds}s"),
+        (0, hours, minutes, _) => format!("{hours}h {minutes}m"),
+        (days, hours, _, _) => format!("{days}d {hours}h"),
+    }
 }
 
 /// Creates a table without a header, in the same style and within the same width. The caller sets the
@@ -271,6 +295,34 @@ mod tests {
             narrow.lines().all(|line| line.chars().count() <= 60),
             "{narrow}"
         );
+    }
+
+    #[test]
+    fn a_row_of_a_list_is_one_line_of_the_terminal() {
+        let mut table = table_within(["NAME", "HOST", "TYPE", "AGE", "STATE"], Some(80));
+        let long = "x".repeat(200);
+        let rows = [["arm_1", "crex-mts", "arm", "3d 4h", "encrypted"]; 2];
+        table.add_rows(rows);
+        table.add_row([&long, &long, &long, "3d 4h", "not encrypted"]);
+        cut_to_lines(&mut table);
+        let lines = table.trim_fmt();
+        assert_eq!(lines.lines().count(), 4, "{lines}");
+        assert!(
+            lines.lines().all(|line| line.chars().count() <= 80),
+            "{lines}"
+        );
+    }
+
+    #[test]
+    fn a_time_span_has_its_two_largest_units() {
+        for (seconds, text) in [
+            (0, "0s"),
+            (75, "1m 15s"),
+            (3600, "1h 0m"),
+            (200_000, "2d 7h"),
+        ] {
+            assert_eq!(time_span(Duration::from_secs(seconds)), text);
+        }
     }
 
     #[test]

@@ -222,7 +222,7 @@ fn the_certificate_of_each_connection_is_shown() {
             .any(|it| it["name"] == *arm && it["link"] == link)
     });
     let table = rover.host.run(&["agents", &arm]).done();
-    assert!(table.contains(", encrypted"), "{table}");
+    assert!(table.contains("  encrypted"), "{table}");
     let routes = rover.host.run(&["routes", "--json"]).done_json();
     assert_eq!(routes["gateway"]["neighbors"][0]["security"], link);
     let routes = rover.host.run(&["routes"]).done();

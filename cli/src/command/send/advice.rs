@@ -4,8 +4,10 @@ use fipa::error::SendError;
 use fipa::monitor::ViolationKind;
 use fipa::{Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, is_pattern};
 
+use fipa_acl::escape_name;
 use fipa_monitor::one_edit_apart;
 
+use crate::output;
 use crate::report::Failure;
 
 /// One failure per reason, with the receivers that it concerns.
@@ -23,6 +25,9 @@ pub(super) fn failures(deliveries: &Deliveries, agent: &Agent, config: &Config) 
     let failure = |(reason, names): (FailureReason, Vec<&str>)| {
         let help = match reason {
             FailureReason::NoSuchAgent => no_such_agent(&names, agent, config),
+            FailureReason::Unreachable => {
+                lost_host(&names, agent).unwrap_or_else(|| advice(reason, config))
+            }
             other => advice(other, config),
         };
         Failure::failed(format!("not delivered: {reason}"), receivers(&names), help)
@@ -110,6 +115,18 @@ fn no_such_agent(names: &[&str], agent: &Agent, config: &Config) -> String {
              so agents on other hosts are unknown: start one with `fipa up`"
         ),
     }
+}
+
+/// The remedy if the host of one of these agents was connected, and is gone.
+fn lost_host(names: &[&str], agent: &Agent) -> Option<String> {
+    let directory = agent.domain().directory();
+    let lost = names.iter().find_map(|name| directory.lost_agent(name))?;
+    let since = output::time_span(lost.registered.elapsed().unwrap_or_default());
+    Some(format!(
+        "its host {} was last seen {since} ago: check that it is switched on and connected, and that `fipa up` \
+         runs there",
+        escape_name(lost.mts.shown())
+    ))
 }
 
 fn advice(reason: FailureReason, config: &Config) -> String {
