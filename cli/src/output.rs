@@ -65,6 +65,18 @@ pub(crate) fn cut_to_lines(table: &mut Table) {
     }
 }
 
+/// A size in the largest unit that represents it exactly, as in the configuration.
+pub(crate) fn size(bytes: u64) -> String {
+    let units = [(30, "GiB"), (20, "MiB"), (10, "KiB")];
+    let exact = units
+        .iter()
+        .find(|(bits, _)| bytes != 0 && bytes.trailing_zeros() >= *bits);
+    match exact {
+        Some((bits, unit)) => format!("{}{unit}", bytes >> bits),
+        None => format!("{bytes} bytes"),
+    }
+}
+
 /// The two largest units of a time, for table cells.
 pub(crate) fn time_span(time: Duration) -> String {
     let seconds = time.as_secs();
@@ -118,6 +130,12 @@ pub(crate) fn converted(converted: &[u8]) -> Result<(), Failure> {
         true => text(&String::from_utf8_lossy(converted)),
         false => bytes(converted),
     }
+}
+
+/// Whether texts on standard output have colors: on a terminal, unless NO_COLOR is set.
+pub(crate) fn has_color() -> bool {
+    let plain = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
+    io::stdout().is_terminal() && !plain
 }
 
 /// Columns of the terminal; `None` if standard output is not a terminal.

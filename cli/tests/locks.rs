@@ -138,6 +138,8 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     }
     assert!(listed["lease_ms"].as_u64().unwrap() <= 600_000);
     let table = host.run(&["locks"]).done();
+    assert!(table.contains("arm") && !table.contains(&fence), "{table}");
+    let table = host.run(&["locks", "--long"]).done();
     assert!(table.contains(&fence) && table.contains("arm"), "{table}");
 }
 

@@ -51,11 +51,12 @@ const NOT_FOUND: u8 = 127;
 Examples:
   fipa lock bay -- ./dock.sh
   fipa lock bay --within 10s -- ./dock.sh
-  fipa lock bay -- sh -c 'fipa send --to lock:bay -p request --content dock --fence $FIPA_FENCE --wait'
+  fipa lock bay -- sh -c \\
+      'fipa send lock:bay dock -p request --fence $FIPA_FENCE --wait'
 
 Exit codes:
   124  the lock was not acquired within the time of --within
-  125  fipa lock has failed: for example, no agent owns the resource, or the lock was lost
+  125  fipa lock has failed: for example, the lock was lost
   126  the command cannot be run
   127  the command was not found
   else that of the command; 128 + the signal if a signal ended it")]

@@ -8,9 +8,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
+use fipa::admin::keys::Keys;
 use fipa::admin::routes::{ASKER_TYPE, Connected, LostHost};
 use fipa::{
-    DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role,
+    Config, DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role,
     Signature, Source, Time,
 };
 use fipa_acl::{Pattern, escape, escape_name};
@@ -18,7 +19,7 @@ use serde_json::{Value, json};
 
 use super::routes::security;
 use crate::complete;
-use crate::membership;
+use crate::membership::{self, stopped_process};
 use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
@@ -42,17 +43,27 @@ Examples:
   fipa agents --platform http://10.0.0.7:7778/acc    of a JADE platform, as its AMS lists them
 
 Columns:
-  HOST       this host, or the gateway of the agent's host; of an agent of a legacy peer its address
+  HOST       this host, or the gateway of the agent's host; of an agent of a
+             legacy peer its address
   AGE        time since its registration
-  STATE      ready: on this host; encrypted, not encrypted: the connection with its host (`fipa routes`
-             has its certificate); no connection: known, for example by mDNS; unsupported: all its
-             locations have unsupported transports; members: of a coalition; lost: the host was connected and is gone
+  STATE      ready         on this host
+             stopped       on this host, and its process is stopped
+             encrypted, not encrypted
+                           the connection with its host; `fipa routes` has its
+                           certificate
+             no connection known, for example by mDNS
+             unsupported   all its locations have unsupported transports
+             N members     of a coalition
+             lost          the host was connected within the last hour
+             not trusted   lost, and its certificate is no longer trusted
 With --long:
-  LOCATIONS  addresses for letters, in order of preference, of an agent on another host those that
-             the gateway uses; for a coalition, its members
+  LOCATIONS  addresses for letters, in order of preference, of an agent on
+             another host those that the gateway uses; for a coalition, its
+             members
   MTS        message transport service that delivers to the agent
-  SOURCE     origin of the entry: host (a process of this host), mdns (announced on the network),
-             exchange (from its gateway), static (the configuration), contact (a letter from it)
+  SOURCE     origin of the entry: host (a process of this host), mdns
+             (announced on the network), exchange (from its gateway), static
+             (the configuration), contact (a letter from it)
 
 JSON:
   { \"domain\": text, \"gateway\": name of this host's gateway, or null,
@@ -247,7 +258,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             config.domain
         ));
     }
-    let lost = listed.lost.iter().map(lost_cells);
+    let trusted = trusted(&config);
+    let lost = listed.lost.iter();
+    let lost = lost.map(|host| lost_cells(host, trusted.as_deref()));
     let table = match arguments.long {
         false => {
             let mut table = output::table(COLUMNS);
@@ -442,7 +455,10 @@ impl Row {
             escape(&entry.agent_type).into_owned(),
             output::time_span(entry.registered.elapsed().unwrap_or_default()),
             match &entry.role {
-                Role::Coalition(members) => format!("{} members", members.names().len()),
+                Role::Coalition(members) => match members.names().len() {
+                    1 => "1 member".to_owned(),
+                    count => format!("{count} members"),
+                },
                 _ => state(entry, link, has_report).to_owned(),
             },
         ];
@@ -473,6 +489,7 @@ fn host(entry: &Entry, at: &[Location]) -> String {
 fn state(entry: &Entry, link: Option<&Connected>, has_report: bool) -> &'static str {
     match entry.reach {
         _ if entry.is_unsupported() => "unsupported",
+        Reach::Local if stopped_process(entry).is_some() => "stopped",
         Reach::Local => "ready",
         Reach::Remote { .. } => match link {
             Some(link) => security(link.security.encrypted),
@@ -483,11 +500,23 @@ fn state(entry: &Entry, link: Option<&Connected>, has_report: bool) -> &'static 
     }
 }
 
+/// The fingerprints of the trusted certificates; `None` without keys.
+fn trusted(config: &Config) -> Option<Vec<String>> {
+    let keys = Some(&config.security.keys).filter(|keys| !keys.is_empty())?;
+    let trusted = Keys::at(keys).trusted().ok()?.into_iter();
+    Some(trusted.map(|it| it.fingerprint().to_string()).collect())
+}
+
 /// The table cells of a lost host.
-fn lost_cells(host: &LostHost) -> [String; 5] {
+fn lost_cells(host: &LostHost, trusted: Option<&[String]>) -> [String; 5] {
     let name = escape_name(&host.name);
     let since = output::time_span(Duration::from_secs(host.seconds));
-    let state = format!("lost {since} ago");
+    let state = match (&host.certificate, trusted) {
+        (Some(certificate), Some(trusted)) if !trusted.contains(certificate) => {
+            "not trusted".to_owned()
+        }
+        _ => format!("lost {since} ago"),
+    };
     let cells = [&*name, &*name, GATEWAY_TYPE, "-", &state];
     cells.map(str::to_owned)
 }
