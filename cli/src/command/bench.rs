@@ -21,7 +21,7 @@ use crate::{membership, output};
 /// Measure latency and throughput on this machine, compared with the raw mechanisms
 ///
 /// Measures one-way latency, round trip, throughput and CPU time of every configured transport, for
-/// content from 100 bytes to 4 MB. Each transport is compared with its limit, which is measured in the
+/// content from 100 bytes to 4 MiB. Each transport is compared with its limit, which is measured in the
 /// same rounds: raw iceoryx2, a raw Unix domain socket, or a raw relay. Gateways are also measured
 /// with TCP over TLS and with QUIC, with temporary keys; their limits are relays of bare rustls and
 /// of bare quinn. All traffic stays on this machine, and no
