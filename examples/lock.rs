@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use fipa::config::Sources;
 use fipa::locks::{OwnOptions, Owned};
-use fipa::{Agent, AgentId, Config, Domain, Performative};
+use fipa::{Agent, Config, Domain, Performative};
 
 /// Maximum wait for the bay.
 const TIMEOUT: Duration = Duration::from_secs(60);
@@ -53,7 +53,7 @@ async fn dock(rover: &Agent) -> Result<[String; 2], Failed> {
     let lock = rover.lock_within("bay", TIMEOUT).await?;
     let command = || -> Result<_, Failed> {
         let dock = rover.message(Performative::Request).content("(dock)");
-        let dock = dock.receiver(AgentId::new("crane")?);
+        let dock = dock.receiver("crane");
         Ok(lock.guard(dock).build()?)
     };
     let (in_time, late) = (command()?, command()?);

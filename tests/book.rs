@@ -47,7 +47,7 @@ async fn a_request_is_served() -> Result<()> {
     // ANCHOR: request
     let request = rover
         .message(Performative::Request)
-        .receiver(AgentId::new("arm_1")?)
+        .receiver("arm_1")
         .content("crate");
     let mut request = rover.request(request, Duration::from_secs(60)).await?;
     if request.agreed().await? {
@@ -170,7 +170,7 @@ async fn loaned_content_arrives() -> Result<()> {
     // ANCHOR: loan
     let message = rover
         .message(Performative::Inform)
-        .receiver(AgentId::new("arm_1")?)
+        .receiver("arm_1")
         .build()?;
     let mut loan = rover.loan(message, picture.len())?;
     loan.content_mut().copy_from_slice(&picture);
@@ -212,7 +212,7 @@ async fn an_own_protocol_is_followed() -> Result<()> {
     // ANCHOR: own_protocol
     let request = rover
         .message(Performative::Request)
-        .receiver(AgentId::new("door")?)
+        .receiver("door")
         .protocol("open-door")
         .conversation_id(rover.unique_id())
         .content("open")

@@ -528,7 +528,7 @@ async fn a_letter_in_the_custody_of_the_other_gateway_that_ends_has_an_outcome_a
     assert!(
         matches!(
             reason,
-            FailureReason::NoSuchAgent | FailureReason::Unconfirmed
+            FailureReason::NoSuchAgent | FailureReason::Unreachable | FailureReason::Unconfirmed
         ),
         "{reason}"
     );

@@ -4,8 +4,10 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
+use fipa::Config;
 use fipa_acl::escape;
 
+use crate::output;
 use crate::report::Failure;
 
 /// Maximum size of a message that a tool converts, in bytes: four times the default maximum of a letter.
@@ -14,6 +16,10 @@ pub(crate) const MAX_MESSAGE: u64 = 256 << 20;
 /// Reads a whole file, or standard input for the path `-`. More than `limit` bytes are an error. A file with
 /// more bytes is not read.
 pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, Failure> {
+    read_within(path, limit, "use a smaller input")
+}
+
+fn read_within(path: &Path, limit: u64, help: &str) -> Result<Vec<u8>, Failure> {
     let mut bytes = Vec::new();
     let read = if path == Path::new("-") {
         read_all(&mut io::stdin().lock(), limit, &mut bytes)
@@ -26,9 +32,9 @@ pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, Failure> {
     match read {
         Ok(true) => Ok(bytes),
         Ok(false) => Err(Failure::failed(
-            format!("the input has more than {limit} bytes"),
+            format!("the input has more than {}", output::size(limit)),
             name(path),
-            "use a smaller input",
+            help,
         )),
         Err(error) => Err(Failure::failed(
             format!("cannot read: {error}"),
@@ -36,6 +42,16 @@ pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, Failure> {
             "give a file that this user can read, or - for standard input",
         )),
     }
+}
+
+/// Reads the content of a message: a file, or standard input. It ends at the size of the largest letter.
+pub(crate) fn content(path: &Path, config: &Config) -> Result<Vec<u8>, Failure> {
+    let limit = config.transport.shm.max_letter;
+    read_within(
+        path,
+        limit,
+        "send less, or increase transport.shm.max_letter in the configuration of all processes",
+    )
 }
 
 /// Refuses input without a byte that is not white space.

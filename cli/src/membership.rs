@@ -110,6 +110,19 @@ fn has_terminal() -> bool {
     std::fs::File::open("/dev/tty").is_ok()
 }
 
+/// Returns the process of a local agent if it is stopped. The name of its service ends with the process.
+pub(crate) fn stopped_process(entry: &Entry) -> Option<u32> {
+    let service = entry.mts.name.as_deref();
+    let service = service.filter(|_| entry.reach == Reach::Local && entry.role == Role::Agent)?;
+    let (_, process) = service.rsplit_once('-')?;
+    let process: u32 = process.parse().ok()?;
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
+    // The name of the program is in parentheses and may contain any character.
+    let (_, after_name) = stat.rsplit_once(')')?;
+    let state = after_name.split_whitespace().next()?;
+    matches!(state, "T" | "t").then_some(process)
+}
+
 /// Joins the domain of the configuration. From then on, `fipa reload` and SIGHUP make the process read it again.
 pub(crate) async fn join(config: &Config) -> Result<Domain, Failure> {
     let joined = Domain::open(config).await;
@@ -319,7 +332,7 @@ pub(crate) fn not_registered(error: RegisterError, name: &str, config: &Config) 
                 holder.mts.shown()
             ),
             domain,
-            "choose another name, or stop that agent (`fipa agents` shows its locations)",
+            "choose another name, or stop that agent (`fipa agents --long` shows its locations)",
         ),
         RegisterError::Invalid(error) => Failure::wrong_usage(
             format!("cannot register the name {name:?}: {}", ErrorChain(&error)),

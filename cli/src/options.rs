@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
+use bytesize::ByteSize;
 use clap::error::{ContextKind, ContextValue};
 use clap::{
     ArgAction, ArgMatches, Args, Command as Clap, CommandFactory, FromArgMatches, Parser, ValueHint,
@@ -205,6 +206,12 @@ pub(crate) fn duration(text: &str) -> Result<Duration, String> {
     duration.map_err(|_| "expected a duration such as 10s, 500ms or 2h".to_owned())
 }
 
+/// Parses a size such as 64KiB, or a number of bytes.
+pub(crate) fn size(text: &str) -> Result<u64, String> {
+    let size = text.parse::<ByteSize>().map(|size| size.as_u64());
+    size.map_err(|_| "expected a size such as 100B, 64KiB or 1MiB".to_owned())
+}
+
 /// Waits for this time, the value of `--for`; without it, forever.
 pub(crate) async fn after(time: Option<Duration>) {
     match time {
@@ -256,6 +263,21 @@ mod tests {
     use std::sync::mpsc::channel;
 
     use super::*;
+
+    #[test]
+    fn a_size_is_a_number_of_bytes_or_has_a_unit() {
+        for (text, bytes) in [
+            ("1000", 1000),
+            ("100B", 100),
+            ("64KiB", 64 << 10),
+            ("1 MiB", 1 << 20),
+        ] {
+            assert_eq!(size(text), Ok(bytes), "{text}");
+        }
+        for text in ["", "MiB", "-1", "1 parsec"] {
+            assert!(size(text).is_err(), "{text}");
+        }
+    }
 
     #[test]
     fn a_thread_that_is_blocked_is_not_waited_for() {

@@ -5,6 +5,7 @@
 use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal, Write};
+use std::time::Duration;
 
 use comfy_table::{Cell, ContentArrangement, Table, presets};
 use fipa::{Deliveries, Outcome};
@@ -57,6 +58,41 @@ pub(crate) fn table<T: Into<Cell>>(columns: impl IntoIterator<Item = T>) -> Tabl
     table_within(columns, terminal_width())
 }
 
+/// Keeps each row of a table on one line of a terminal: what does not fit is cut.
+pub(crate) fn cut_to_lines(table: &mut Table) {
+    for row in table.row_iter_mut() {
+        row.max_height(1);
+    }
+}
+
+/// A size in the largest unit that represents it exactly, as in the configuration.
+pub(crate) fn size(bytes: u64) -> String {
+    let units = [(30, "GiB"), (20, "MiB"), (10, "KiB")];
+    let exact = units
+        .iter()
+        .find(|(bits, _)| bytes != 0 && bytes.trailing_zeros() >= *bits);
+    match exact {
+        Some((bits, unit)) => format!("{}{unit}", bytes >> bits),
+        None => format!("{bytes} bytes"),
+    }
+}
+
+/// The two largest units of a time, for table cells.
+pub(crate) fn time_span(time: Duration) -> String {
+    let seconds = time.as_secs();
+    match (
+        seconds / 86_400,
+        seconds / 3600 % 24,
+        seconds / 60 % 60,
+        seconds % 60,
+    ) {
+        (0, 0, 0, seconds) => format!("{seconds}s"),
+        (0, 0, minutes, seconds) => format!("{minutes}m {seconds}s"),
+        (0, hours, minutes, _) => format!("{hours}h {minutes}m"),
+        (days, hours, _, _) => format!("{days}d {hours}h"),
+    }
+}
+
 /// Creates a table without a header, in the same style and within the same width. The caller sets the
 /// padding of its columns.
 pub(crate) fn rows() -> Table {
@@ -94,6 +130,12 @@ pub(crate) fn converted(converted: &[u8]) -> Result<(), Failure> {
         true => text(&String::from_utf8_lossy(converted)),
         false => bytes(converted),
     }
+}
+
+/// Whether texts on standard output have colors: on a terminal, unless NO_COLOR is set.
+pub(crate) fn has_color() -> bool {
+    let plain = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
+    io::stdout().is_terminal() && !plain
 }
 
 /// Columns of the terminal; `None` if standard output is not a terminal.
@@ -271,6 +313,34 @@ mod tests {
             narrow.lines().all(|line| line.chars().count() <= 60),
             "{narrow}"
         );
+    }
+
+    #[test]
+    fn a_row_of_a_list_is_one_line_of_the_terminal() {
+        let mut table = table_within(["NAME", "HOST", "TYPE", "AGE", "STATE"], Some(80));
+        let long = "x".repeat(200);
+        let rows = [["arm_1", "crex-mts", "arm", "3d 4h", "encrypted"]; 2];
+        table.add_rows(rows);
+        table.add_row([&long, &long, &long, "3d 4h", "not encrypted"]);
+        cut_to_lines(&mut table);
+        let lines = table.trim_fmt();
+        assert_eq!(lines.lines().count(), 4, "{lines}");
+        assert!(
+            lines.lines().all(|line| line.chars().count() <= 80),
+            "{lines}"
+        );
+    }
+
+    #[test]
+    fn a_time_span_has_its_two_largest_units() {
+        for (seconds, text) in [
+            (0, "0s"),
+            (75, "1m 15s"),
+            (3600, "1h 0m"),
+            (200_000, "2d 7h"),
+        ] {
+            assert_eq!(time_span(Duration::from_secs(seconds)), text);
+        }
     }
 
     #[test]

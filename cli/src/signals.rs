@@ -1,6 +1,6 @@
 //! The signals that a command handles.
 
-use std::io;
+use std::io::{self, IsTerminal as _, Write as _};
 
 use rustix::process::Signal;
 use tokio::signal::unix::{self, SignalKind};
@@ -38,9 +38,21 @@ impl Signals {
     /// Waits for the next signal.
     pub(crate) async fn next(&mut self) -> Signal {
         tokio::select! {
-            _ = self.interrupt.recv() => Signal::INT,
+            _ = self.interrupt.recv() => {
+                end_echoed_line();
+                Signal::INT
+            }
             _ = self.terminate.recv() => Signal::TERM,
             _ = self.hang_up.recv() => Signal::HUP,
         }
+    }
+}
+
+/// Ends the line in which the terminal echoes `^C`, so that the next output begins on a line of its own.
+fn end_echoed_line() {
+    let mut stderr = io::stderr();
+    if stderr.is_terminal() && io::stdin().is_terminal() {
+        // There is no other place to report an error.
+        let _ = stderr.write_all(b"\n");
     }
 }

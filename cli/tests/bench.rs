@@ -326,7 +326,7 @@ fn the_evaluation_of_the_paper_is_repeated() {
     let tables = written("paper.md");
     assert!(tables.contains("measured elsewhere"), "{tables}");
     assert!(
-        tables.contains("| bit-efficient | XML | 1 MB |"),
+        tables.contains("| bit-efficient | XML | 1 MiB |"),
         "{tables}"
     );
     for picture in ["paper-sizes.svg", "paper-times.svg"] {

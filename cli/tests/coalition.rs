@@ -25,7 +25,7 @@ fn a_coalition_is_listed_and_receives_letters() {
     assert_eq!(listed["role"], "coalition");
     assert_eq!(listed["members"], serde_json::json!(["parrot", "owl"]));
     assert_eq!(listed["leader"], "owl");
-    let table = host.run(&["agents", "birds"]).done();
+    let table = host.run(&["agents", "birds", "--long"]).done();
     assert!(table.contains("owl (leader)"), "{table}");
     let sent = host.run(&["send", "--to", "birds", "--content", "hello", "--json"]);
     let sent = sent.done_json().to_string();

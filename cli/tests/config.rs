@@ -155,6 +155,12 @@ df = true                            # default
 
 [routes]
 \"arm_.*\" = [\"tcp\"]                   # fipa.toml:5
+
+[discovery.static]                   # default
+
+[access.allow]                       # default
+
+[access.deny]                        # default
 ";
     assert_eq!(shown, ran(0, expected, ""));
 
@@ -237,6 +243,13 @@ fn check_reports_no_errors_for_a_valid_file() {
         env.run(&["config", "check"]),
         ran(0, "no errors: fipa.toml\n", "")
     );
+    let tcp = ["config", "check", "--set", "mts.transports=tcp"];
+    let unusable = env.run(&tcp);
+    assert_eq!(unusable.code, Some(2));
+    let help = "list tcp and set transport.tcp.processes = true\n";
+    assert!(unusable.stderr.ends_with(help), "{unusable:?}");
+    let usable = [&tcp[..], &["--set", "transport.tcp.processes=true"]].concat();
+    assert_eq!(env.run(&usable).code, Some(0));
     let as_json = env.run(&["config", "check", "--json"]);
     assert_eq!(
         (as_json.code, as_json.json()),

@@ -222,7 +222,7 @@ fn the_certificate_of_each_connection_is_shown() {
             .any(|it| it["name"] == *arm && it["link"] == link)
     });
     let table = rover.host.run(&["agents", &arm]).done();
-    assert!(table.contains(", encrypted"), "{table}");
+    assert!(table.contains("  encrypted"), "{table}");
     let routes = rover.host.run(&["routes", "--json"]).done_json();
     assert_eq!(routes["gateway"]["neighbors"][0]["security"], link);
     let routes = rover.host.run(&["routes"]).done();
@@ -249,6 +249,13 @@ fn the_certificate_of_each_connection_is_shown() {
     );
     let (_, found) = finding(&report, "connections with other gateways");
     assert!(found.contains(fingerprint.as_str().unwrap()), "{found}");
+
+    rover.keys(&["distrust", &crex.name]);
+    until("the host is listed as not trusted", || {
+        let keys = format!("security.keys={}", rover.dir());
+        let table = rover.host.run(&["agents", "--set", &keys]).done();
+        table.contains("  not trusted")
+    });
 }
 
 #[test]

@@ -53,7 +53,7 @@ fn letters_to_an_agent_with_only_udt_locations_fail_at_once() {
         json!(["udt://127.0.0.1:9;fipa-services"])
     );
     assert_eq!(agent["unsupported_transports"], json!(["udt"]));
-    let table = host.run(&["agents", "cpp"]).done();
+    let table = host.run(&["agents", "cpp", "--long"]).done();
     let shown = "udt://127.0.0.1:9;fipa-services (unsupported transport udt)";
     assert!(table.contains(shown), "{table}");
     let routes = host.run(&["routes", "cpp"]).done();
@@ -101,7 +101,7 @@ fn an_agent_of_a_legacy_peer_is_listed_with_its_own_address() {
         assert_eq!(agent["name"], name);
         let at = format!("tcp://127.0.0.1:{port};fipa-services");
         assert_eq!(agent["locations"], json!([at]));
-        let table = host.run(&["agents", &pattern]).done();
+        let table = host.run(&["agents", &pattern, "--long"]).done();
         assert!(table.contains(&at), "{table}");
     }
 }

@@ -101,7 +101,9 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     );
 
     let late = host.run(&["lock", "bay", "--within", "300ms", "--", "true"]);
-    assert!(late.failed(124).contains("timed out waiting for \"bay\""));
+    let late = late.failed(124);
+    let problem = "timed out waiting for \"bay\", with 1 request ahead\nwhere: resource \"bay\", held by \"rover\"";
+    assert!(late.contains(problem), "{late}");
     let arguments = ["lock", "bay", "--agent", "arm", "--", "sh", "-c", HOLD];
     let waiting = host.command(&arguments);
     let waiting = std::thread::spawn(move || Running::new(waiting));
@@ -136,6 +138,8 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
     }
     assert!(listed["lease_ms"].as_u64().unwrap() <= 600_000);
     let table = host.run(&["locks"]).done();
+    assert!(table.contains("arm") && !table.contains(&fence), "{table}");
+    let table = host.run(&["locks", "--long"]).done();
     assert!(table.contains(&fence) && table.contains("arm"), "{table}");
 }
 

@@ -238,7 +238,7 @@ fn an_agent_behind_a_killed_gateway_is_unreachable() {
     let delivery = &json["deliveries"][0];
     assert_eq!(delivery["reason"], "unreachable", "{json}");
     let attempt = delivery["attempts"][0].to_string();
-    let why = "the connection with the gateway crex ended";
+    let why = "its host crex was last seen at ";
     assert!(attempt.contains(&at) && attempt.contains(why), "{attempt}");
     assert!(output.contains("fipa doctor"), "{output}");
     // Other names do not exist.
@@ -405,7 +405,8 @@ fn a_second_agent_of_the_same_name_is_rejected() {
 fn too_large_content_fails_on_every_route() {
     let host = Host::new();
     let _echo = host.echo("camera");
-    std::fs::write(host.path("large.raw"), vec![0; 2 << 20]).unwrap();
+    // With its envelope, the letter is longer than its content.
+    std::fs::write(host.path("large.raw"), vec![0; 1 << 20]).unwrap();
     let send = [
         "--set",
         "transport.shm.max_letter=1MiB",
@@ -429,7 +430,7 @@ fn too_large_content_fails_on_every_route() {
         "{output}"
     );
     assert!(
-        output.contains("transport.shm.max_letter (now 1048576 bytes here)"),
+        output.contains("transport.shm.max_letter (now 1MiB here)"),
         "{output}"
     );
 }
@@ -495,4 +496,51 @@ fn a_signal_during_the_wait_for_a_reply_leaves_no_files() {
     );
     assert_eq!(echo.signal("-HUP"), (Some(0), String::new()));
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn content_from_an_endless_source_ends_at_the_largest_letter() {
+    let host = Host::new();
+    let output = host.run(&[
+        "send",
+        "arm",
+        "--content-file",
+        "/dev/zero",
+        "--set",
+        "transport.shm.max_letter=1MiB",
+    ]);
+    let output = output.failed(1);
+    assert!(
+        output.starts_with("error: the input has more than 1MiB\nwhere: /dev/zero\n"),
+        "{output}"
+    );
+}
+
+#[test]
+fn outcomes_are_in_the_order_of_the_receivers() {
+    let host = Host::new();
+    let _agents = ["arm_1", "arm_2", "leg"].map(|name| host.echo(name));
+    let to = ["--to", "leg", "--to", "nothing", "--to", "arm_.*"];
+    let send = [&["send", "--content", "x", "--json"], &to[..]].concat();
+    let (json, _) = host.run(&send).failed_json();
+    let deliveries = json["deliveries"].as_array().unwrap().iter();
+    let receivers: Vec<&str> = deliveries
+        .map(|one| one["receiver"].as_str().unwrap())
+        .collect();
+    assert_eq!(receivers[..2], ["leg", "nothing"]);
+    assert!(receivers[2..].iter().all(|it| it.starts_with("arm_")));
+}
+
+#[test]
+fn a_receiver_whose_process_is_stopped_is_named() {
+    let host = Host::new();
+    let arm = host.echo("arm");
+    arm.send_signal("-STOP");
+    let send = ["send", "arm", "hello", "--deadline", "300ms"];
+    let (_, error) = host.run(&send).failed_text();
+    let stopped = format!("the process {} of arm is stopped", arm.pid());
+    assert!(error.contains(&stopped), "{error}");
+    let table = host.run(&["agents"]).done();
+    assert!(table.contains("  stopped"), "{table}");
+    arm.send_signal("-CONT");
 }

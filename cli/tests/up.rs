@@ -9,6 +9,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use common::{Host, Running};
+use fipa_testbed::until;
 use serde_json::{Value, json};
 
 #[test]
@@ -190,17 +191,19 @@ fn agents_are_listed_and_filtered() {
     let table = host.run(&["agents"]).done();
     let lines: Vec<&str> = table.lines().collect();
     assert!(
-        lines[0].starts_with("NAME    TYPE  REACH      LOCATIONS "),
+        lines[0].starts_with("NAME    HOST       TYPE  AGE "),
         "{table}"
     );
+    assert!(lines[1].starts_with("arm_1   this host  arm   "), "{table}");
+    assert!(table.contains("\ncamera  this host  eye   "), "{table}");
     assert!(
-        lines[1].starts_with("arm_1   arm   this host  shm://"),
+        lines
+            .iter()
+            .all(|line| line.len() <= 80 && !line.contains("://")),
         "{table}"
     );
-    assert!(
-        table.contains("\ncamera  eye   this host  shm://"),
-        "{table}"
-    );
+    let long = host.run(&["agents", "--long"]).done();
+    assert!(long.contains("  ready  shm://"), "{long}");
 
     let listed = host.run(&["agents", "--json"]).done_json();
     assert_eq!(
@@ -313,7 +316,7 @@ fn an_agent_on_another_host_is_listed_and_reached() {
     );
     let table = here.run(&["agents", &name]).done();
     assert!(
-        table.contains(&format!("  via mts-{}  ", here.domain)),
+        table.contains(&format!("  mts-{}  ", there.domain)) && !table.contains("://"),
         "{table}"
     );
 
@@ -332,6 +335,35 @@ fn an_agent_on_another_host_is_listed_and_reached() {
 
     assert_eq!(echo.signal("-INT"), (Some(0), String::new()));
     gateway.wait_for_log(&["INFO", "left", &name]);
+}
+
+#[test]
+fn a_host_that_is_gone_is_listed_as_lost_and_named_in_outcomes() {
+    let (here, there) = (Host::new(), Host::new());
+    let other = there.start(&["up", "--json", "--set", "mts.name=crex-mts"]);
+    let peer = format!(
+        "discovery.static={{ crex-mts = [\"tcp://{}\"] }}",
+        other.tcp_address()
+    );
+    let _gateway = here.start(&["up", "--set", &peer]);
+    let name = format!("arm-{}", there.domain);
+    let _arm = there.echo(&name);
+    let listed = |what: &str, text: &str| {
+        until(what, || here.run(&["agents"]).done().contains(text));
+    };
+    listed("the agent is listed", "  not encrypted");
+    assert_eq!(other.signal("-INT").0, Some(0));
+    listed("the host is lost", "  lost ");
+    let listed = here.run(&["agents", "--json"]).done_json();
+    assert_eq!(listed["lost"][0]["name"], "crex-mts", "{listed}");
+    for filter in [&["--local"][..], &["--type", "arm"], &["no-such-name"]] {
+        let table = here.run(&[&["agents"], filter].concat()).done();
+        assert!(!table.contains("lost"), "{table}");
+    }
+    until("a letter names the host", || {
+        let (outcome, error) = here.run(&["send", &name, "hello"]).failed_text();
+        outcome.contains("unreachable") && error.contains("its host crex-mts was last seen ")
+    });
 }
 
 #[test]

@@ -480,7 +480,7 @@ fn a_withdrawn_request_is_answered_and_its_grant_released() {
     agent.sent();
     // The time ends while two members have not agreed.
     agent.pass(300);
-    let failure = Failure::TimedOut { ahead: 2 };
+    let failure = Failure::TimedOut { ahead: Some(2) };
     let resource = bay();
     assert_eq!(
         agent.events(),
@@ -521,7 +521,7 @@ fn try_lock_withdraws_after_one_round() {
     let failed = |claim, ahead| Event::Failed {
         claim,
         resource: bay(),
-        failure: Failure::TimedOut { ahead },
+        failure: Failure::TimedOut { ahead: Some(ahead) },
     };
     assert_eq!(agent.events(), [failed(second, 2)]);
     agent.pass(1_000);

@@ -72,10 +72,10 @@ pub trait Directory: Send + Sync {
         matching.cloned().collect()
     }
 
-    /// Returns the last entries of agents that this directory listed until their gateway fell silent.
-    /// They are not among the [entries](Self::entries). They tell an agent that cannot be reached
-    /// from one that does not exist, for one minute. Bounded by
-    /// [`Exchange::MAX_LOST`](crate::Exchange::MAX_LOST).
+    /// Returns the last entries of agents that this directory listed until their gateway was gone. The
+    /// time of registration of such an entry is the time when the gateway was last seen. They are not
+    /// among the [entries](Self::entries). They tell an agent that cannot be reached from one that does
+    /// not exist, for one hour. Bounded by [`Exchange::MAX_LOST`](crate::Exchange::MAX_LOST).
     fn lost_agents(&self) -> Vec<Arc<Entry>> {
         Vec::new()
     }

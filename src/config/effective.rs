@@ -168,6 +168,12 @@ impl Effective {
             };
             let _ = writeln!(text, "{line:<36} # {origin}");
         }
+        for map in MAPS {
+            if (map.read)(&self.config).is_empty() {
+                let table = format!("[{}]", dotted(map.path));
+                let _ = writeln!(text, "\n{table:<36} # default");
+            }
+        }
         text
     }
 }

@@ -5,7 +5,7 @@
 
 use std::net::{IpAddr, UdpSocket};
 
-use fipa_transport::Location;
+use fipa_transport::{Kind, Location};
 
 use super::check::Finding;
 use super::{Config, Interface, PeerConfig};
@@ -17,7 +17,23 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     interfaces(config, &mut found);
     keys(config, &mut found);
     protocols(config, &mut found);
+    local_transports(config, &mut found);
     found
+}
+
+/// A gateway runs without a transport within the host. Other processes do not.
+fn local_transports(config: &Config, found: &mut Vec<Finding>) {
+    let transports = &config.mts.transports;
+    let is_usable = |kind: &Kind| {
+        kind.is_host_local() || (*kind == Kind::Tcp && config.transport.tcp.processes)
+    };
+    if !transports.iter().any(is_usable) {
+        found.push(Finding::new(
+            &["mts", "transports"],
+            "has none for processes of one host, so only a gateway can use this configuration",
+            "list shm or unix, or list tcp and set transport.tcp.processes = true",
+        ));
+    }
 }
 
 fn static_peers(config: &Config, found: &mut Vec<Finding>) {

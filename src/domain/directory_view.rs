@@ -3,7 +3,7 @@
 use std::fmt;
 use std::sync::Arc;
 
-use fipa_sds::{Directory, Entry, Query, Watch};
+use fipa_sds::{Directory, Entry, Query, Source, Watch};
 use fipa_transport::Incarnation;
 #[cfg(feature = "protocols")]
 use fipa_transport::PeerId;
@@ -80,6 +80,14 @@ impl<'a> DirectoryView<'a> {
     #[must_use]
     pub fn search(self, query: &Query) -> Vec<Arc<Entry>> {
         self.0.search(query)
+    }
+
+    /// Returns the last entry of the agent of this name whose host was connected within the last hour and is gone.
+    /// The time of registration of the entry is the time when the host was last seen.
+    #[must_use]
+    pub fn lost_agent(self, name: &str) -> Option<Arc<Entry>> {
+        let mut lost = self.0.lost_agents().into_iter();
+        lost.find(|entry| *entry.name == *name && entry.source != Source::Contact)
     }
 
     /// Reads the latest changes of other processes.

@@ -30,6 +30,10 @@ pub struct RouteReport {
     pub peers: Vec<StaticPeer>,
     /// The gateways with an open connection; empty unless the service is a gateway.
     pub neighbors: Vec<Connected>,
+    /// The hosts that were connected within the last hour and are not connected now, the latest first, at most 64;
+    /// empty unless the service is a gateway.
+    #[serde(default)]
+    pub lost: Vec<LostHost>,
     /// The connections that the service has refused because only one side has keys, because a side does not
     /// trust the other, or because the sides have different versions of the protocol, the latest first; empty unless the service is a gateway. Of each address
     /// the latest, of at most 16 addresses.
@@ -94,6 +98,19 @@ pub struct Connected {
     /// The security of its connections.
     #[serde(default)]
     pub security: LinkSecurity,
+}
+
+/// A gateway whose last connection has ended.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct LostHost {
+    /// The name of the gateway.
+    pub name: String,
+    /// Seconds since the end of the connection.
+    pub seconds: u64,
+    /// The fingerprint of the trusted certificate that the gateway proved; `None` without encryption, where the name
+    /// is a claim.
+    pub certificate: Option<String>,
 }
 
 /// A connection that a gateway has refused because of keys or of another version of the protocol.

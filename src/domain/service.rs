@@ -276,6 +276,7 @@ impl Service {
             neighbors: Vec::new(),
             refused: Vec::new(),
             refused_dials: Vec::new(),
+            lost: Vec::new(),
             contested: Vec::new(),
             namesakes: Vec::new(),
             configuration: BTreeMap::new(),

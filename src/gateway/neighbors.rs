@@ -22,7 +22,7 @@ use fipa_transport::{
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
-use crate::admin::routes::{Connected, LinkSecurity};
+use crate::admin::routes::{Connected, LinkSecurity, LostHost};
 
 /// The gateways with an open connection. The number of connections bounds their number.
 #[derive(Debug, Default)]
@@ -43,16 +43,42 @@ struct State {
     own_name: Option<Arc<str>>,
     /// Whether a neighbor with the same name was reported.
     has_namesake: bool,
-    /// Neighbors whose last connection has ended, with the time of the end, the latest last.
-    disconnected: VecDeque<(Instant, Arc<Entry>)>,
+    /// Neighbors whose last connection has ended, the latest last.
+    disconnected: VecDeque<Disconnected>,
+}
+
+/// A neighbor whose last connection has ended.
+#[derive(Debug)]
+struct Disconnected {
+    at: Instant,
+    entry: Arc<Entry>,
+    principal: Principal,
+}
+
+impl Disconnected {
+    /// Whether the neighbor is the same host that has connected again. Without keys, the name of a host is a
+    /// claim, and its address may change.
+    fn is_back_as(&self, neighbor: &Neighbor) -> bool {
+        let is_same = match self.principal {
+            Principal::Certificate(_) => self.principal == neighbor.principal,
+            Principal::Host | Principal::Unproved => true,
+        };
+        is_same && self.entry.name == neighbor.entry.name
+    }
 }
 
 /// Time for which a disconnected neighbor is still greeted when this host gets another address. The
 /// connections may have ended because this host lost its address, long before it gets another.
 const STILL_GREETED: Duration = Duration::from_secs(600);
 
+/// Time for which a disconnected neighbor is reported as lost.
+const LOST: Duration = Duration::from_secs(3600);
+
 /// Maximum number of disconnected neighbors that are stored.
 const MAX_DISCONNECTED: usize = 64;
+
+/// Maximum number of disconnected neighbors with one certificate, or without keys at one address.
+const MAX_DISCONNECTED_OF_PEER: usize = 8;
 
 /// Maximum number of suspected locations that wait to be handled.
 const MAX_SUSPECTED: usize = 64;
@@ -209,7 +235,7 @@ impl Neighbors {
         self.generation.fetch_add(1, Ordering::Release);
         state
             .disconnected
-            .retain(|(_, entry)| entry.incarnation != incarnation);
+            .retain(|gone| gone.entry.incarnation != incarnation);
         if changed {
             self.changed.notify_one();
         }
@@ -236,25 +262,47 @@ impl Neighbors {
             return;
         }
         if let Some(gone) = state.present.remove(&incarnation) {
-            if state.disconnected.len() >= MAX_DISCONNECTED {
-                state.disconnected.pop_front();
-            }
-            state.disconnected.push_back((now, gone.entry));
+            state.record_disconnected(Disconnected {
+                at: now,
+                entry: gone.entry,
+                principal: gone.principal,
+            });
         }
         self.generation.fetch_add(1, Ordering::Release);
         self.changed.notify_one();
         log_limit::info!(of: source(&peer.hop.location), name = %escape_name(&peer.name), at = %peer.hop.location, "no longer connected");
     }
 
+    /// Returns the hosts that were connected within the last hour and are not, the latest first.
+    pub(super) fn lost(&self, now: Instant) -> Vec<LostHost> {
+        let state = self.state.lock();
+        let mut lost: Vec<&Disconnected> = Vec::new();
+        for gone in state.disconnected.iter().rev() {
+            let is_over = gone.at + LOST <= now;
+            let is_back = state.present.values().any(|it| gone.is_back_as(it));
+            let is_same = |later: &&Disconnected| {
+                later.entry.name == gone.entry.name && later.principal == gone.principal
+            };
+            if !is_over && !is_back && !lost.iter().any(is_same) {
+                lost.push(gone);
+            }
+        }
+        let reported = |gone: &Disconnected| LostHost {
+            name: gone.entry.name.to_string(),
+            seconds: now.saturating_duration_since(gone.at).as_secs(),
+            certificate: security(gone.principal).certificate,
+        };
+        lost.into_iter().map(reported).collect()
+    }
+
     /// Returns the gateways to greet from the current locations of this one, by name and location:
     /// the connected ones, and those that were connected within the last [`PARTED`].
     pub(super) fn to_greet(&self, now: Instant) -> Vec<(Arc<str>, Location)> {
-        let mut state = self.state.lock();
-        state
-            .disconnected
-            .retain(|(since, _)| *since + STILL_GREETED > now);
+        let state = self.state.lock();
         let present = state.present.values().map(|neighbor| &neighbor.entry);
-        let recent = state.disconnected.iter().map(|(_, entry)| entry);
+        let recent = state.disconnected.iter();
+        let recent = recent.filter(|gone| gone.at + STILL_GREETED > now);
+        let recent = recent.map(|gone| &gone.entry);
         let all = present.chain(recent).flat_map(|entry| {
             // The transports race the locations of one kind, so one of each kind is enough.
             let mut kinds = Vec::new();
@@ -274,6 +322,23 @@ impl State {
     fn is_namesake(&mut self, name: &str) -> bool {
         let is_same = self.own_name.as_deref() == Some(name);
         is_same && !std::mem::replace(&mut self.has_namesake, true)
+    }
+
+    /// Stores a disconnected neighbor. The oldest one makes room, first one of the same peer.
+    fn record_disconnected(&mut self, gone: Disconnected) {
+        let same = self.disconnected.iter().enumerate();
+        let same = same.filter(|(_, it)| it.entry.peer == gone.entry.peer);
+        let same: Vec<usize> = same.map(|(place, _)| place).collect();
+        match same.first() {
+            Some(oldest) if same.len() >= MAX_DISCONNECTED_OF_PEER => {
+                self.disconnected.remove(*oldest);
+            }
+            _ if self.disconnected.len() >= MAX_DISCONNECTED => {
+                self.disconnected.pop_front();
+            }
+            _ => {}
+        }
+        self.disconnected.push_back(gone);
     }
 
     /// Returns the neighbor with this new connection, based on its state before.
@@ -454,6 +519,10 @@ impl DirectoryView for PresentView {
     fn all(&self) -> Arc<[Arc<Entry>]> {
         self.all.all()
     }
+
+    fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
+        self.all.lost_agent(name)
+    }
 }
 
 #[cfg(test)]
@@ -584,5 +653,59 @@ mod tests {
         neighbors.disconnected(now, &one);
         assert_eq!(neighbors.to_greet(now + STILL_GREETED / 2), greeted);
         assert_eq!(neighbors.to_greet(now + STILL_GREETED), []);
+    }
+
+    /// Creates the introduction of a gateway of this name, with the certificate of this number.
+    fn proved(name: &str, address: &str, incarnation: u64, certificate: u8) -> Introduction {
+        let location = at(address).with_incarnation(Incarnation::from_u64(incarnation));
+        Introduction {
+            name: name.into(),
+            hop: Hop {
+                location,
+                principal: Principal::Certificate([certificate; 32]),
+            },
+            ..introduction(address, None)
+        }
+    }
+
+    #[test]
+    fn a_host_that_is_gone_is_lost_until_it_returns() {
+        let (neighbors, now) = (Neighbors::default(), Instant::now());
+        let lost = |seconds| {
+            let lost = neighbors.lost(now + Duration::from_secs(seconds));
+            let lost = lost.into_iter().map(|host| (host.name, host.seconds));
+            lost.collect::<Vec<_>>()
+        };
+        let crex = proved("crex-mts", "10.0.0.2:1", 1, 1);
+        neighbors.introduced(&crex);
+        assert_eq!(lost(0), []);
+        neighbors.disconnected(now, &crex);
+        assert_eq!(lost(75), [("crex-mts".to_owned(), 75)]);
+        // Another host that claims the name.
+        neighbors.introduced(&proved("crex-mts", "10.0.0.3:1", 2, 2));
+        assert_eq!(lost(75).len(), 1);
+        // The host after its restart.
+        let restarted = proved("crex-mts", "10.0.0.2:1", 3, 1);
+        neighbors.introduced(&restarted);
+        assert_eq!(lost(75), []);
+        neighbors.disconnected(now + Duration::from_secs(100), &restarted);
+        assert_eq!(lost(110), [("crex-mts".to_owned(), 10)], "listed once");
+        assert_eq!(lost(3700), []);
+    }
+
+    #[test]
+    fn a_peer_that_reconnects_under_many_names_hides_no_lost_host() {
+        let (neighbors, now) = (Neighbors::default(), Instant::now());
+        let part = |peer: Introduction| {
+            neighbors.introduced(&peer);
+            neighbors.disconnected(now, &peer);
+        };
+        part(proved("crex-mts", "10.0.0.2:1", 1, 1));
+        for number in 2..200 {
+            part(proved(&format!("x{number}"), "10.0.0.3:1", number, 2));
+        }
+        let lost = neighbors.lost(now);
+        assert_eq!(lost.len(), 1 + MAX_DISCONNECTED_OF_PEER);
+        assert_eq!(lost.last().map(|host| host.name.as_str()), Some("crex-mts"));
     }
 }

@@ -39,12 +39,13 @@ pub enum LockError {
         owner: String,
     },
     /// The time of the request is over.
-    #[error("timed out waiting for {resource:?}, with an estimated {ahead} requests ahead")]
+    #[error("timed out waiting for {resource:?}{}", requests_ahead(*.ahead))]
     TimedOut {
         /// The resource.
         resource: String,
-        /// Estimate of the number of requests that would have been served before.
-        ahead: usize,
+        /// Estimate of the number of requests that would have been served before; `None` if the owner has not
+        /// told the place of the request. It tells the first eight.
+        ahead: Option<usize>,
     },
     /// The owner refuses the request.
     #[error("the owner of {resource:?} refuses: {reason}")]
@@ -97,6 +98,14 @@ pub enum LockError {
     /// This process is a forked child of the one that registered the agent.
     #[error(transparent)]
     Forked(#[from] Forked),
+}
+
+fn requests_ahead(ahead: Option<usize>) -> String {
+    match ahead {
+        Some(1) => ", with 1 request ahead".to_owned(),
+        Some(ahead) => format!(", with about {ahead} requests ahead"),
+        None => String::new(),
+    }
 }
 
 impl From<BackgroundError> for LockError {

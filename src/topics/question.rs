@@ -65,7 +65,7 @@ impl Agent {
             .language("fipa-sl")
             .content(content);
         // The deadlines of the question and of the answer.
-        let timeout = self.domain().inner.deadline * 2;
+        let timeout = self.domain().inner.deadline() * 2;
         let answer = self.query(message, timeout).await?.result().await?;
         read_answer(answer.content().map_or(&[][..], |content| content))
     }

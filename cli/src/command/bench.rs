@@ -1,7 +1,8 @@
 //! `fipa bench`: the shell of the crate `fipa-bench`, which measures.
 
+use std::cell::Cell;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
@@ -13,14 +14,14 @@ use fipa_bench::{
 };
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::options::Global;
+use crate::options::{self, Global};
 use crate::report::{Failure, warn};
 use crate::{membership, output};
 
 /// Measure latency and throughput on this machine, compared with the raw mechanisms
 ///
 /// Measures one-way latency, round trip, throughput and CPU time of every configured transport, for
-/// content from 100 bytes to 4 MB. Each transport is compared with its limit, which is measured in the
+/// content from 100 bytes to 4 MiB. Each transport is compared with its limit, which is measured in the
 /// same rounds: raw iceoryx2, a raw Unix domain socket, or a raw relay. Gateways are also measured
 /// with TCP over TLS and with QUIC, with temporary keys; their limits are relays of bare rustls and
 /// of bare quinn. All traffic stays on this machine, and no
@@ -68,10 +69,10 @@ pub(crate) struct Arguments {
         long,
         value_delimiter = ',',
         value_name = "SIZE",
-        value_parser = size,
+        value_parser = options::size,
         default_value = "100B,1KiB,64KiB,1MiB,4MiB"
     )]
-    sizes: Vec<ByteSize>,
+    sizes: Vec<u64>,
     /// Numbers of agents that share a resource, for `locks` [default: 2,8,32; with --quick 2,8]
     #[arg(long, value_delimiter = ',', value_name = "N")]
     agents: Vec<usize>,
@@ -261,9 +262,9 @@ fn measure_locks(arguments: &Arguments, baseline: Option<Baseline>) -> Result<()
     }
     let measured: LocksReport = membership::run(async {
         let machine = observe().await;
-        let progress = progress(locks.steps());
-        let measured = locks.run(machine, |step| advance(&progress, step)).await;
-        progress.finish_and_clear();
+        let progress = Progress::new(locks.steps());
+        let measured = locks.run(machine, |step| progress.begin(step)).await;
+        progress.end();
         measured.map_err(|error| match error {
             BenchError::Agents(_) => {
                 let advice = format!("use 2 to {} agents", Locks::MAX_AGENTS);
@@ -287,10 +288,10 @@ fn measure_locks(arguments: &Arguments, baseline: Option<Baseline>) -> Result<()
 
 async fn measure(comparison: Comparison) -> Result<Measurement, Failure> {
     let machine = observe().await;
-    let progress = progress(comparison.steps());
-    let measured = comparison.run(machine, |step| advance(&progress, step));
+    let progress = Progress::new(comparison.steps());
+    let measured = comparison.run(machine, |step| progress.begin(step));
     let measured = measured.await;
-    progress.finish_and_clear();
+    progress.end();
     measured.map_err(failed)
 }
 
@@ -314,10 +315,10 @@ fn measure_peers(arguments: &Arguments, jade: &str, config: &Config) -> Result<(
         let options = RegisterOptions::default();
         let agent = membership::register(&domain, &name, options, config).await?;
         let gateway = membership::gateway(&domain).ok_or_else(membership::no_gateway)?;
-        let progress = progress(Peers::STEPS);
-        let report = peers.measure(&agent, &gateway, |step| advance(&progress, step));
+        let progress = Progress::new(Peers::STEPS);
+        let report = peers.measure(&agent, &gateway, |step| progress.begin(step));
         let report = report.await;
-        progress.finish_and_clear();
+        progress.end();
         drop(agent);
         domain.close().await;
         report.map_err(failed)
@@ -370,9 +371,9 @@ fn measure_paper(arguments: &Arguments) -> Result<(), Failure> {
     };
     let paper = membership::run(async {
         let machine = observe().await;
-        let progress = progress(Paper::STEPS);
-        let paper = Paper::measure(machine, cycles, |step| advance(&progress, step)).await;
-        progress.finish_and_clear();
+        let progress = Progress::new(Paper::STEPS);
+        let paper = Paper::measure(machine, cycles, |step| progress.begin(step)).await;
+        progress.end();
         paper.map_err(failed)
     })?;
     paper.write(directory).map_err(failed)?;
@@ -414,13 +415,8 @@ fn failed(error: BenchError) -> Failure {
     Failure::failed(ErrorChain(&error).to_string(), place, advice)
 }
 
-fn size(text: &str) -> Result<ByteSize, String> {
-    let size = text.parse();
-    size.map_err(|_| "expected a size such as 100B, 64KiB or 1MiB".to_owned())
-}
-
 fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
-    let sizes = arguments.sizes.iter().map(ByteSize::as_u64);
+    let sizes = arguments.sizes.iter().copied();
     let effort = if arguments.quick {
         Effort::quick(sizes)
     } else {
@@ -449,17 +445,50 @@ fn this_program() -> Result<Program, Failure> {
 }
 
 /// A bar that is not drawn when standard error is no terminal.
-fn progress(steps: usize) -> ProgressBar {
-    let progress = ProgressBar::new(steps as u64);
-    let style = ProgressStyle::with_template("{bar:30} {elapsed}, {eta} left: {msg}");
-    progress.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-    progress.enable_steady_tick(Duration::from_millis(200));
-    progress
+struct Progress {
+    bar: ProgressBar,
+    /// Time and number of the first step that measures.
+    first: Cell<Option<(Instant, u64)>>,
 }
 
-fn advance(progress: &ProgressBar, step: &str) {
-    progress.inc(1);
-    progress.set_message(step.to_owned());
+impl Progress {
+    fn new(steps: usize) -> Self {
+        let bar = ProgressBar::new(steps as u64);
+        let style = ProgressStyle::with_template("{bar:30} {elapsed}, {msg}");
+        bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+        bar.enable_steady_tick(Duration::from_millis(200));
+        let first = Cell::default();
+        Self { bar, first }
+    }
+
+    /// Shows that a step begins, and the time that is left. The estimate is the mean of the steps that measure:
+    /// the starts of processes before them are short.
+    fn begin(&self, step: &str) {
+        self.bar.inc(1);
+        if step.starts_with("starting ") {
+            return self.bar.set_message(step.to_owned());
+        }
+        let (now, number) = (Instant::now(), self.bar.position());
+        let (since, first) = self.first.get().unwrap_or((now, number));
+        self.first.set(Some((since, first)));
+        let steps = self.bar.length().unwrap_or(number);
+        let left = time_left(now - since, number - first, steps + 1 - number.min(steps));
+        let left = left.map(|left| format!("about {} left: ", output::time_span(left)));
+        self.bar
+            .set_message(format!("{}{step}", left.unwrap_or_default()));
+    }
+
+    fn end(&self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+/// The time for the steps that are left if they take as long as those that are done, on average.
+fn time_left(elapsed: Duration, done: u64, left: u64) -> Option<Duration> {
+    let done = u32::try_from(done).ok().filter(|done| *done > 0)?;
+    elapsed
+        .checked_mul(u32::try_from(left).ok()?)?
+        .checked_div(done)
 }
 
 /// The absolute path of a program, because its processes run in another directory.
@@ -471,4 +500,17 @@ fn program(given: &Path) -> Result<PathBuf, Failure> {
             "build the program: cargo build --release --manifest-path benches/comparison/zenoh/Cargo.toml",
         )
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_left_is_that_of_steps_of_mean_length() {
+        let elapsed = Duration::from_secs(30);
+        assert_eq!(time_left(elapsed, 3, 12), Some(Duration::from_secs(120)));
+        assert_eq!(time_left(elapsed, 3, 0), Some(Duration::ZERO));
+        assert_eq!(time_left(elapsed, 0, 12), None);
+    }
 }

@@ -53,7 +53,7 @@ JSON:
 Examples:
   fipa config check
   fipa config check --config robot.toml
-  fipa config check --set mts.transports=tcp
+  fipa config check --set mts.deadline=9s
 
 JSON:
   { \"ok\": true or false,

@@ -41,10 +41,14 @@ Examples:
   fipa do crex lift --deadline 30s --json
   fipa do crex lift --agent operator --id lift-17
 
-Values are texts, numbers, true, false, or any value in FIPA-SL. A value with a unit after a blank is
-accepted if the unit is that of the parameter. `fipa actions ROBOT` shows the parameters.
+Values are texts, numbers, true, false, or any value in FIPA-SL. A value with a
+unit after a blank is accepted if the unit is that of the parameter.
+`fipa actions ROBOT` shows the parameters.
 
-Exit codes: 0 done; 1 refused, failed, cancelled, or not reached; 2 an invalid command line.
+Exit codes:
+  0  done
+  1  refused, failed, cancelled, or not reached
+  2  an invalid command line
 
 JSON, one object on a line:
   { \"event\": \"accepted\", \"goal\": id }

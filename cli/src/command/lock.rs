@@ -51,11 +51,12 @@ const NOT_FOUND: u8 = 127;
 Examples:
   fipa lock bay -- ./dock.sh
   fipa lock bay --within 10s -- ./dock.sh
-  fipa lock bay -- sh -c 'fipa send --to lock:bay -p request --content dock --fence $FIPA_FENCE --wait'
+  fipa lock bay -- sh -c \\
+      'fipa send lock:bay dock -p request --fence $FIPA_FENCE --wait'
 
 Exit codes:
   124  the lock was not acquired within the time of --within
-  125  fipa lock has failed: for example, no agent owns the resource, or the lock was lost
+  125  fipa lock has failed: for example, the lock was lost
   126  the command cannot be run
   127  the command was not found
   else that of the command; 128 + the signal if a signal ended it")]
@@ -138,27 +139,44 @@ async fn acquire(agent: &Agent, arguments: &Arguments) -> Result<Lock, Failure> 
             None => agent.lock(resource).await,
         }
     };
-    locked.await.map_err(|error| {
-        let code = match error {
-            LockError::TimedOut { .. } | LockError::OwnerNotFound { .. } => TIMED_OUT,
-            _ => FAILED,
-        };
-        let help = match error {
-            LockError::NoOwner { .. } | LockError::OwnerNotFound { .. } => {
-                "start the owner, for example `fipa own RESOURCE`; an owner of the C++ library distributed_locking \
-                 needs --legacy-peers here"
-            }
-            LockError::OtherAlgorithm { .. } => "leave --algorithm out, or name that of the owner",
-            LockError::TimedOut { .. } if arguments.group.legacy_peers() => {
-                "`fipa locks` shows the owner, the holder and the waiting agents; an owner of the C++ library \
-                 distributed_locking answers only its own algorithm, so name that with --algorithm"
-            }
-            LockError::Name(_) => "use a name of 1 to 255 bytes without control characters",
-            _ => "`fipa locks` shows the owner, the holder and the waiting agents",
-        };
-        let place = format!("resource {resource:?}");
-        Failure::failed(ErrorChain(&error).to_string(), place, help).with_code(code)
-    })
+    let error = match locked.await {
+        Ok(lock) => return Ok(lock),
+        Err(error) => error,
+    };
+    let mut place = format!("resource {resource:?}");
+    if matches!(error, LockError::TimedOut { .. })
+        && let Some(holder) = holder(agent, resource).await
+    {
+        place += &format!(", held by {holder:?}");
+    }
+    let code = match error {
+        LockError::TimedOut { .. } | LockError::OwnerNotFound { .. } => TIMED_OUT,
+        _ => FAILED,
+    };
+    let help = match error {
+        LockError::NoOwner { .. } | LockError::OwnerNotFound { .. } => {
+            "start the owner, for example `fipa own RESOURCE`; an owner of the C++ library distributed_locking \
+             needs --legacy-peers here"
+        }
+        LockError::OtherAlgorithm { .. } => "leave --algorithm out, or name that of the owner",
+        LockError::TimedOut { .. } if arguments.group.legacy_peers() => {
+            "`fipa locks` shows the owner, the holder and the waiting agents; an owner of the C++ library \
+             distributed_locking answers only its own algorithm, so name that with --algorithm"
+        }
+        LockError::Name(_) => "use a name of 1 to 255 bytes without control characters",
+        _ => "`fipa locks` shows the owner, the holder and the waiting agents",
+    };
+    Err(Failure::failed(ErrorChain(&error).to_string(), place, help).with_code(code))
+}
+
+/// Maximum wait for the name of the holder after the time of --within.
+const HOLDER_TIMEOUT: Duration = Duration::from_millis(500);
+
+/// The holder of a resource, as its owner reports it.
+async fn holder(agent: &Agent, resource: &str) -> Option<String> {
+    let locks = agent.query_locks(HOLDER_TIMEOUT).await.ok()?;
+    let mut locks = locks.into_iter();
+    locks.find(|lock| lock.resource == resource)?.holder
 }
 
 /// Runs the command.

@@ -25,24 +25,25 @@ const INTERVAL: Duration = Duration::from_secs(1);
 #[command(after_help = "\
 Examples:
   fipa locks
+  fipa locks --long
   fipa locks --json | jq -r '.locks[] | select(.holder) | .resource'
   fipa locks --watch
 
 Columns:
   OWNER    agent that grants the resource, and another one that also claims it
   HOLDER   agent that holds it; - if it is free, ? if the owner does not answer
-  FENCE    fence of the grant
   LEASE    remaining time of the grant, unless the holder extends it
-  WAITING  agents that wait, the next one first
+  WAITING  the next agent, and the number of others; with --long their names
+  FENCE    with --long: fence of the grant
 
 JSON:
-  { \"domain\": text, \"locks\": [ { \"resource\", \"owner\": name, \"answered\": whether the owner answered,
-    \"holder\": name or null, \"fence\": text or null, \"lease_ms\": number or null,
+  { \"domain\": text, \"locks\": [ { \"resource\", \"owner\": name,
+    \"answered\": whether the owner answered, \"holder\": name or null, \"fence\": text or null, \"lease_ms\": number or null,
     \"waiters\": [ name ] at most 16, \"waiting\": number,
     \"contested_by\": name or null } ] }
 
-With --watch, the list is printed again when a grant, an owner or a waiting agent changes; with --json,
-each list is on a line of its own.")]
+With --watch, the list is printed again when a grant, an owner or a waiting
+agent changes; with --json, each list is on a line of its own.")]
 pub(crate) struct Arguments {
     /// Continue, and print the list again after each change, until Ctrl-C
     #[arg(long, short)]
@@ -59,6 +60,10 @@ pub(crate) struct Arguments {
     /// Maximum wait for the answers of the owners
     #[arg(long, value_name = "TIME", default_value = "2s", value_parser = options::duration)]
     timeout: Duration,
+
+    /// Also show the fences, and all agents that wait
+    #[arg(long, short, conflicts_with = "json")]
+    long: bool,
 
     /// Print JSON
     #[arg(long)]
@@ -142,48 +147,62 @@ fn print(locks: &[ResourceStatus], arguments: &Arguments, config: &Config) -> Re
             config.domain
         ));
     }
-    let mut table = output::table(COLUMNS);
-    table.add_rows(locks.iter().map(cells));
+    let table = match arguments.long {
+        false => {
+            let mut table = output::table(COLUMNS);
+            table.add_rows(locks.iter().map(|status| cells(status, false)));
+            output::cut_to_lines(&mut table);
+            table
+        }
+        true => {
+            let mut table = output::table(COLUMNS.into_iter().chain(["FENCE"]));
+            table.add_rows(locks.iter().map(|status| {
+                let fence = status.fence.as_ref().map(ToString::to_string);
+                let fence = name_or(fence.as_deref(), status);
+                cells(status, true).into_iter().chain([fence])
+            }));
+            table
+        }
+    };
     output::text(&format!("{}\n", table.trim_fmt()))
 }
 
-const COLUMNS: [&str; 6] = ["RESOURCE", "OWNER", "HOLDER", "FENCE", "LEASE", "WAITING"];
+const COLUMNS: [&str; 5] = ["RESOURCE", "OWNER", "HOLDER", "LEASE", "WAITING"];
 
-fn cells(status: &ResourceStatus) -> [String; 6] {
-    let none = match status.is_reported {
-        true => "-",
-        false => "?",
-    };
-    let name = |name: &Option<String>| match name {
-        Some(name) => escape_name(name).into_owned(),
-        None => none.to_owned(),
-    };
-    let mut owner = name(&status.owner);
-    if let Some(rival) = &status.contested_by {
-        owner += &format!("\ncontested by {}", escape_name(rival));
+/// The text of a cell that may be empty.
+fn name_or(name: Option<&str>, status: &ResourceStatus) -> String {
+    match (name, status.is_reported) {
+        (Some(name), _) => escape_name(name).into_owned(),
+        (None, true) => "-".to_owned(),
+        (None, false) => "?".to_owned(),
     }
-    let lease = status.expires.map(|lease_left| {
-        let whole = Duration::from_secs(lease_left.as_secs());
-        humantime::format_duration(whole).to_string()
-    });
-    let mut waiting: Vec<String> = status
-        .waiters
-        .iter()
+}
+
+/// The cells of a resource: on one line, or with all agents that wait.
+fn cells(status: &ResourceStatus, with_all: bool) -> [String; 5] {
+    let mut owner = name_or(status.owner.as_deref(), status);
+    if let Some(rival) = &status.contested_by {
+        owner += &format!(", contested by {}", escape_name(rival));
+    }
+    let lease = status.expires.map(output::time_span);
+    let most = if with_all { usize::MAX } else { 1 };
+    let named = status.waiters.iter().take(most);
+    let mut waiting: Vec<String> = named
         .map(|waiter| escape_name(waiter).into_owned())
         .collect();
     let more = status.waiting.saturating_sub(waiting.len());
     if more > 0 {
         waiting.push(format!("and {more} more"));
     }
+    let separator = if with_all { "\n" } else { " " };
     [
         escape(&status.resource).into_owned(),
         owner,
-        name(&status.holder),
-        name(&status.fence.as_ref().map(ToString::to_string)),
-        lease.unwrap_or_else(|| none.to_owned()),
+        name_or(status.holder.as_deref(), status),
+        name_or(lease.as_deref(), status),
         match waiting.is_empty() {
-            true => none.to_owned(),
-            false => waiting.join("\n"),
+            true => name_or(None, status),
+            false => waiting.join(separator),
         },
     ]
 }

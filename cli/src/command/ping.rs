@@ -32,7 +32,7 @@ Examples:
   fipa ping arm_1                            until Ctrl-C
   fipa ping arm_1 -c 5
   fipa ping arm_1 --for 1min
-  fipa ping arm_1 --count 1000 --interval 10ms --size 1000 --json | tail -n 1
+  fipa ping arm_1 --count 1000 --interval 10ms --size 1KiB --json | tail -n 1
 
 JSON, one object on each line:
   { \"ping\": number, \"outcome\", \"via\" or \"reason\", \"milliseconds\": number, if it was delivered }
@@ -51,10 +51,9 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "TIME", default_value = "1s", value_parser = interval)]
     interval: Duration,
 
-    /// Length of the content, in bytes
-    #[arg(long, value_name = "BYTES", default_value = "0",
-          value_parser = clap::value_parser!(u32).range(0..=16 << 20))]
-    size: u32,
+    /// Size of the content, for example 64KiB or 1000 (bytes)
+    #[arg(long, value_name = "SIZE", default_value = "0", value_parser = content_size)]
+    size: usize,
 
     /// End after this time, for example 10s
     #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
@@ -75,6 +74,16 @@ fn interval(text: &str) -> Result<Duration, String> {
         false => Ok(interval),
     }
 }
+
+/// Parses the size of the content, at most 16 MiB.
+fn content_size(text: &str) -> Result<usize, String> {
+    let size = usize::try_from(options::size(text)?).ok();
+    let size = size.filter(|size| *size <= MAX_CONTENT);
+    size.ok_or_else(|| "the content may have at most 16MiB".to_owned())
+}
+
+/// Maximum size of the content of a ping, in bytes.
+const MAX_CONTENT: usize = 16 << 20;
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
@@ -121,7 +130,7 @@ async fn ping_all(agent: &Agent, arguments: &Arguments, tally: &mut Tally) -> Re
     let mut starts = tokio::time::interval(arguments.interval);
     let to = arguments.addresses.of(agent, &arguments.name).await?;
     starts.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let content = vec![b'.'; arguments.size as usize];
+    let content = vec![b'.'; arguments.size];
     while arguments.count.is_none_or(|count| tally.pings < count) {
         starts.tick().await;
         let message = agent

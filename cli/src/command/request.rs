@@ -33,7 +33,7 @@ Examples:
   fipa request arm_1 '(lift crate)'
   fipa request arm_1 '(lift crate)' --timeout 5m
   fipa request arm_1 '(lift crate)' --json | jq -r .result.content
-  fipa request arm@jade '(lift crate)' --address http://10.0.0.7:7778/acc    an agent of another platform
+  fipa request arm@jade '(lift crate)' --address http://10.0.0.7:7778/acc    of another platform
 
 JSON:
   { \"agreed\": whether the agent agreed before its result,

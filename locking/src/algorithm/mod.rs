@@ -245,8 +245,8 @@ pub trait MutualExclusion: Clone + Eq + Hash + fmt::Debug {
     /// Members that this agent waits for. The extended algorithms need them probed.
     fn awaited(&self) -> BTreeSet<LockPeer>;
 
-    /// Estimate of the number of agents that enter before this one.
-    fn ahead(&self) -> usize;
+    /// Estimate of the number of agents that enter before this one, if it is known.
+    fn ahead(&self) -> Option<usize>;
 
     /// Place of the open request in the owner's queue, if the owner has told it.
     fn place(&self) -> Option<u32> {
@@ -360,7 +360,7 @@ impl MutualExclusion for AnyAlgorithm {
         either!(self, algorithm => algorithm.awaited())
     }
 
-    fn ahead(&self) -> usize {
+    fn ahead(&self) -> Option<usize> {
         either!(self, algorithm => algorithm.ahead())
     }
 

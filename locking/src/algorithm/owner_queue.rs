@@ -81,9 +81,9 @@ impl MutualExclusion for OwnerQueue {
     }
 
     /// The holder and the agents before this one. Only the first are told their places.
-    fn ahead(&self) -> usize {
+    fn ahead(&self) -> Option<usize> {
         self.place
-            .map_or(0, |place| usize::try_from(place).unwrap_or(usize::MAX))
+            .map(|place| usize::try_from(place).unwrap_or(usize::MAX))
     }
 
     fn place(&self) -> Option<u32> {

@@ -274,8 +274,8 @@ impl MutualExclusion for RicartAgrawala {
         }
     }
 
-    fn ahead(&self) -> usize {
-        self.own.as_ref().map_or(0, |own| own.awaited.len())
+    fn ahead(&self) -> Option<usize> {
+        self.own.as_ref().map(|own| own.awaited.len())
     }
 
     #[cfg(test)]

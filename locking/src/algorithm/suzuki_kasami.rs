@@ -524,9 +524,9 @@ impl MutualExclusion for SuzukiKasami {
         }
     }
 
-    fn ahead(&self) -> usize {
+    fn ahead(&self) -> Option<usize> {
         let waiting = self.own.as_ref().is_some_and(|own| !own.entered);
-        usize::from(waiting) + self.requests.len().saturating_sub(1)
+        Some(usize::from(waiting) + self.requests.len().saturating_sub(1))
     }
 
     #[cfg(test)]

@@ -181,10 +181,10 @@ impl<A: MutualExclusion> Locks<A> {
         if entry.is_some_and(|entry| entry.owner.is_none()) {
             return self.fail(now, id, Failure::OwnerNotFound, out);
         }
-        let ahead = entry.map_or(0, |entry| {
+        let ahead = entry.and_then(|entry| {
             let position = entry.waiting.iter().position(|waiting| *waiting == id);
             let current = usize::from(position.is_some() && entry.current.is_some());
-            position.unwrap_or(0) + current + entry.algorithm.ahead()
+            Some(position.unwrap_or(0) + current + entry.algorithm.ahead()?)
         });
         self.fail(now, id, Failure::TimedOut { ahead }, out);
     }

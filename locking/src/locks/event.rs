@@ -132,10 +132,11 @@ pub enum Failure {
         owner: LockPeer,
     },
     /// The time of the claim is over.
-    #[error("timed out with an estimated {ahead} requests ahead")]
+    #[error("timed out")]
     TimedOut {
-        /// Estimate of the number of requests that would have been served before.
-        ahead: usize,
+        /// Estimate of the number of requests that would have been served before; `None` if the owner has not
+        /// told the place of the request.
+        ahead: Option<usize>,
     },
     /// The owner refuses.
     #[error("the owner refuses: {0}")]

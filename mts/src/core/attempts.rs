@@ -98,19 +98,16 @@ impl AttemptTable {
                 error: TransportError::new(TransportErrorKind::Unreachable, why),
             })
         };
+        let time = Time::from_system_time(lost.registered).ok();
+        let time = time.and_then(Time::to_rfc3339).unwrap_or_default();
         if lost.source == Source::Contact {
-            let time = Time::from_system_time(lost.registered).ok();
-            let time = time.and_then(Time::to_rfc3339).unwrap_or_default();
             let why = format!(
                 "the gateway forgot this agent at {time}, because it knows as many of that host as it can; it can be \
                  answered after it sends another letter"
             );
             return (FailureReason::NoSuchAgent, attempt(why));
         }
-        let why = format!(
-            "the connection with the gateway {} ended without a farewell, and has not been restored since",
-            lost.mts.shown()
-        );
+        let why = format!("its host {} was last seen at {time}", lost.mts.shown());
         (FailureReason::Unreachable, attempt(why))
     }
 

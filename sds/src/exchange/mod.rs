@@ -28,7 +28,7 @@ mod wire;
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::ops::Bound;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{ErrorChain, escape_name};
 use fipa_transport::{Incarnation, Location, Mandate, PeerId, Principal, log_limit};
@@ -39,7 +39,7 @@ pub use directory::ExchangeDirectory;
 use directory::{AgentList, Sender};
 use wire::{Changes, ExchangeMessage, Full};
 
-use crate::entry::time_of_millis;
+use crate::entry::{millis_of_time, time_of_millis};
 use crate::shares;
 use crate::{Entry, MtsId, Reach, Role, Source};
 
@@ -62,12 +62,12 @@ pub struct Exchange {
     withdrawn: HashMap<Incarnation, Principal>,
     /// Time until which the changes of locations have used up the rate of a peer, if it is not over.
     relocated_until: HashMap<PeerId, Instant>,
-    /// The agents of neighbors that fell silent, the latest last.
+    /// The agents of neighbors that are gone, the latest last.
     lost: VecDeque<LostGateway>,
     random: u64,
 }
 
-/// The agents of a gateway that fell silent without a farewell.
+/// The agents of a gateway that fell silent, or said goodbye.
 #[derive(Debug)]
 struct LostGateway {
     mts: MtsId,
@@ -232,7 +232,7 @@ impl Exchange {
     /// usually restored.
     pub const MEMORY: Duration = Duration::from_secs(5);
     /// Time for which agents are [lost](crate::Directory::lost_agents) after that.
-    pub const LOST: Duration = Duration::from_secs(60);
+    pub const LOST: Duration = Duration::from_secs(3600);
     /// Maximum number of lost agents. Beyond it, the lists of the peers with most are cut.
     pub const MAX_LOST: usize = 1024;
 
@@ -573,6 +573,7 @@ impl Exchange {
             ExchangeMessage::Goodbye => {
                 neighbor.stored = None;
                 neighbor.staged = None;
+                self.lose(now, from);
                 self.directory.forget(from);
                 Ok(())
             }
@@ -690,8 +691,8 @@ impl Exchange {
         }
     }
 
-    /// Remembers the agents of a gateway that fell silent. If there are too many, the lists with most are
-    /// cut.
+    /// Remembers the agents of a gateway that is gone, with the time when it was last seen. If there are too
+    /// many, the lists with most are cut.
     fn lose(&mut self, now: Instant, gateway: Incarnation) {
         let Some(neighbor) = self.neighbors.get(&gateway) else {
             return;
@@ -700,6 +701,18 @@ impl Exchange {
         if agents.is_empty() {
             return;
         }
+        let silence = neighbor
+            .gone
+            .map(|gone| now.saturating_duration_since(gone));
+        let seen = SystemTime::now().checked_sub(silence.unwrap_or_default());
+        let seen = time_of_millis(seen.map_or(0, millis_of_time));
+        let lost_since_then = |agent: Arc<Entry>| {
+            Arc::new(Entry {
+                registered: seen,
+                ..Entry::clone(&agent)
+            })
+        };
+        let agents: Vec<Arc<Entry>> = agents.into_iter().map(lost_since_then).collect();
         self.lost.push_back(LostGateway {
             mts: neighbor.mts.clone(),
             peer: neighbor.sender().peer,
@@ -712,6 +725,7 @@ impl Exchange {
         for (lost, most) in self.lost.iter_mut().zip(allowed) {
             lost.agents.truncate(most);
         }
+        self.lost.retain(|lost| !lost.agents.is_empty());
         self.show_lost();
     }
 

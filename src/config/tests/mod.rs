@@ -391,6 +391,10 @@ arm = ["tcp", "shm"]                 # fipa.toml:10
 
 [discovery.static]
 crex-mts = ["tcp://10.0.0.2:7788"]   # fipa.toml:12
+
+[access.allow]                       # default
+
+[access.deny]                        # default
 "#;
     assert_eq!(effective.render(), expected);
     assert_eq!(config(expected, &[]), effective.into_config());

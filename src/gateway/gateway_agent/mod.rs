@@ -258,6 +258,7 @@ impl GatewayAgent {
         let neighbors = self.neighbors.all().into_iter();
         let report = routes::RouteReport {
             neighbors: neighbors.map(Into::into).collect(),
+            lost: self.neighbors.lost(Instant::now()),
             refused: self.refusals.latest().into_iter().map(Into::into).collect(),
             refused_dials: self
                 .refused_dials

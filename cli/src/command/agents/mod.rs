@@ -8,9 +8,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
-use fipa::admin::routes::{ASKER_TYPE, LinkSecurity};
+use fipa::admin::keys::Keys;
+use fipa::admin::routes::{ASKER_TYPE, Connected, LostHost};
 use fipa::{
-    DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role,
+    Config, DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role,
     Signature, Source, Time,
 };
 use fipa_acl::{Pattern, escape, escape_name};
@@ -18,7 +19,7 @@ use serde_json::{Value, json};
 
 use super::routes::security;
 use crate::complete;
-use crate::membership;
+use crate::membership::{self, stopped_process};
 use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
@@ -26,8 +27,8 @@ use crate::report::Failure;
 /// List the agents of the domain
 ///
 /// Lists the agents, coalitions and the gateway of the domain on this host. If a gateway is running
-/// (`fipa up`), it also lists the agents on other hosts that the gateway knows. The command itself
-/// needs no gateway.
+/// (`fipa up`), it also lists the agents on other hosts that the gateway knows, and the hosts that were
+/// connected within the last hour and are gone. The command itself needs no gateway.
 ///
 /// A pattern is a regular expression for the whole text, such as `arm_.*`. A text without any of
 /// `* + ? [ ( { | ^ $ \` is compared literally. If several filters are given, all must match.
@@ -35,21 +36,34 @@ use crate::report::Failure;
 #[command(after_help = "\
 Examples:
   fipa agents
-  fipa agents 'arm_.*'
+  fipa agents 'arm_.*' --long
   fipa agents --type camera --json | jq -r '.agents[].name'
   fipa agents --location 'tcp://10\\.0\\.0\\.2:.*' --remote
   fipa agents --watch
   fipa agents --platform http://10.0.0.7:7778/acc    of a JADE platform, as its AMS lists them
 
 Columns:
-  REACH      this host, or the gateway that forwards letters to the agent, and whether its
-             connection with the agent's host is encrypted (`fipa routes` has its certificate)
-  LOCATIONS  addresses for letters, in order of preference, of an agent of a legacy peer those that
-             the gateway uses; for a coalition, its members
-  MTS        message transport service that delivers to the agent
-  SOURCE     origin of the entry: host (a process of this host), mdns (announced on the network),
-             exchange (from its gateway), static (the configuration), contact (a letter from it)
+  HOST       this host, or the gateway of the agent's host; of an agent of a
+             legacy peer its address
   AGE        time since its registration
+  STATE      ready         on this host
+             stopped       on this host, and its process is stopped
+             encrypted, not encrypted
+                           the connection with its host; `fipa routes` has its
+                           certificate
+             no connection known, for example by mDNS
+             unsupported   all its locations have unsupported transports
+             N members     of a coalition
+             lost          the host was connected within the last hour
+             not trusted   lost, and its certificate is no longer trusted
+With --long:
+  LOCATIONS  addresses for letters, in order of preference, of an agent on
+             another host those that the gateway uses; for a coalition, its
+             members
+  MTS        message transport service that delivers to the agent
+  SOURCE     origin of the entry: host (a process of this host), mdns
+             (announced on the network), exchange (from its gateway), static
+             (the configuration), contact (a letter from it)
 
 JSON:
   { \"domain\": text, \"gateway\": name of this host's gateway, or null,
@@ -61,7 +75,9 @@ JSON:
                   \"locations\": [ text ], \"unsupported_transports\": [ transport ], if no
                   location has a supported one, \"mts\": { \"name\", \"incarnation\" },
                   \"incarnation\", \"registered\": time, \"source\": as above,
-                  \"addresses\": [ text ], those of the gateway of this host for platforms } ] }
+                  \"addresses\": [ text ], those of the gateway of this host for platforms } ],
+    \"lost\": [ { \"name\", \"seconds\" since it was last seen,
+                \"certificate\": fingerprint or null } ] }
 
 With --platform, as `fipa ams --json`.
 With --watch, one object on each line; the first lines are the agents present at the start:
@@ -127,6 +143,10 @@ pub(crate) struct Arguments {
     #[arg(long = "for", value_name = "TIME", requires = "watch", value_parser = options::duration)]
     time: Option<Duration>,
 
+    /// Also show the locations, the service and the origin of each agent
+    #[arg(long, short, conflicts_with_all = ["json", "watch", "platform"])]
+    long: bool,
+
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -149,6 +169,24 @@ impl Filter {
         let is_asker = *entry.agent_type == *ASKER_TYPE;
         let is_probed = is_legacy(entry) && entry.name.starts_with(platform::PROBED);
         reach && !is_asker && !is_probed && self.query.matches(entry)
+    }
+
+    /// Whether the lost host is shown: only its name is known.
+    fn matches_lost(&self, host: &LostHost) -> bool {
+        let Query {
+            name,
+            agent_type,
+            location,
+            description,
+            mts,
+            registered,
+            member,
+        } = &self.query;
+        let others = [agent_type, location, description, mts, registered, member];
+        let is_named = |name: &Matcher| name.matches(&host.name);
+        !self.local
+            && others.iter().all(|filter| filter.is_none())
+            && name.as_ref().is_none_or(is_named)
     }
 }
 
@@ -181,13 +219,13 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let entries = directory.entries();
         let shown = entries.iter().filter(|entry| filter.matches(entry));
         let shown: Vec<&Arc<Entry>> = shown.collect();
-        let is_reported =
-            |entry: &&Arc<Entry>| entry.reach != Reach::Local || entry.role == Role::Gateway;
-        let reported = match shown.iter().any(is_reported) {
-            // Without its report the agents are listed as well.
-            true => Reported::asked(&domain, &shown).await,
-            false => Reported::default(),
+        // Without its report the agents are listed as well.
+        let is_gateway_shown = shown.iter().any(|entry| entry.role == Role::Gateway);
+        let reported = match gateway(directory) {
+            Some(_) if is_gateway_shown || !filter.local => Reported::asked(&domain, &shown).await,
+            _ => Reported::default(),
         };
+        let lost = reported.lost.iter();
         let listed = Listed {
             domain_is_empty: entries.is_empty(),
             gateway: gateway(directory).map(|entry| entry.name.to_string()),
@@ -195,17 +233,22 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 .iter()
                 .map(|entry| Row::of(entry, directory, &reported))
                 .collect(),
+            lost: lost
+                .filter(|host| filter.matches_lost(host))
+                .cloned()
+                .collect(),
         };
         domain.close().await;
         Ok(listed)
     })?;
     if arguments.json {
         let agents: Vec<&Value> = listed.entries.iter().map(|row| &row.json).collect();
-        return output::json(
-            &json!({ "domain": config.domain, "gateway": listed.gateway, "agents": agents }),
-        );
+        return output::json(&json!({
+            "domain": config.domain, "gateway": listed.gateway, "agents": agents,
+            "lost": listed.lost,
+        }));
     }
-    if listed.entries.is_empty() {
+    if listed.entries.is_empty() && listed.lost.is_empty() {
         let matching = match listed.domain_is_empty {
             true => "",
             false => " that matches the filters",
@@ -215,8 +258,25 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             config.domain
         ));
     }
-    let mut table = output::table(COLUMNS);
-    table.add_rows(listed.entries.into_iter().map(|row| row.cells));
+    let trusted = trusted(&config);
+    let lost = listed.lost.iter();
+    let lost = lost.map(|host| lost_cells(host, trusted.as_deref()));
+    let table = match arguments.long {
+        false => {
+            let mut table = output::table(COLUMNS);
+            table.add_rows(listed.entries.into_iter().map(|row| row.cells));
+            table.add_rows(lost);
+            output::cut_to_lines(&mut table);
+            table
+        }
+        true => {
+            let mut table = output::table(COLUMNS.into_iter().chain(LONG_COLUMNS));
+            let rows = listed.entries.into_iter();
+            table.add_rows(rows.map(|row| row.cells.into_iter().chain(row.long_cells)));
+            table.add_rows(lost);
+            table
+        }
+    };
     output::text(&format!("{}\n", table.trim_fmt()))
 }
 
@@ -230,10 +290,12 @@ struct Reported {
     /// The addresses at which platforms such as JADE write to the gateway.
     addresses: Vec<Location>,
     /// Its connections, by the service at the other end.
-    links: HashMap<Incarnation, LinkSecurity>,
+    links: HashMap<Incarnation, Connected>,
     /// The locations of agents of legacy peers, by name: the directory of the host has only the locations of
     /// the gateway, through which letters to them go.
     legacy: HashMap<String, Vec<Location>>,
+    /// The hosts that are gone.
+    lost: Vec<LostHost>,
 }
 
 impl Reported {
@@ -263,11 +325,12 @@ impl Reported {
             };
             let neighbors = report.neighbors.into_iter();
             reported.gateway = report.incarnation;
+            reported.lost = report.lost;
             reported.addresses = report.locations;
             let is_foreign = |at: &Location| at.signature() != Signature::Frames;
             reported.addresses.retain(is_foreign);
             reported.links = neighbors
-                .map(|neighbor| (neighbor.incarnation, neighbor.security))
+                .map(|neighbor| (neighbor.incarnation, neighbor))
                 .collect();
             reported
                 .legacy
@@ -302,19 +365,25 @@ struct Listed {
     domain_is_empty: bool,
     gateway: Option<String>,
     entries: Vec<Row>,
+    lost: Vec<LostHost>,
 }
 
-const COLUMNS: [&str; 7] = ["NAME", "TYPE", "REACH", "LOCATIONS", "MTS", "SOURCE", "AGE"];
+/// Type of gateways in the directory.
+const GATEWAY_TYPE: &str = "fipa-mts";
+
+const COLUMNS: [&str; 5] = ["NAME", "HOST", "TYPE", "AGE", "STATE"];
+const LONG_COLUMNS: [&str; 3] = ["LOCATIONS", "MTS", "SOURCE"];
 
 /// An agent as table cells and as JSON.
 struct Row {
-    cells: [String; 7],
+    cells: [String; 5],
+    long_cells: [String; 3],
     json: Value,
 }
 
 impl Row {
     fn of(entry: &Entry, directory: DirectoryView<'_>, reported: &Reported) -> Self {
-        let links = &reported.links;
+        let has_report = reported.gateway.is_known();
         let own = reported
             .legacy
             .get(&*entry.name)
@@ -342,11 +411,11 @@ impl Row {
             "registered": registered.ok().and_then(Time::to_rfc3339),
             "source": entry.source,
         });
-        let link = links.get(&entry.mts.incarnation);
+        let link = reported.links.get(&entry.mts.incarnation);
         if let Some(gateway) = &through {
             json["gateway"] = gateway.as_str().into();
-            if !links.is_empty() {
-                json["link"] = json!(link);
+            if has_report {
+                json["link"] = json!(link.map(|link| &link.security));
             }
         }
         if entry.is_unsupported() {
@@ -374,26 +443,82 @@ impl Row {
                 let own = entry.locations.iter().map(location_text);
                 own.chain(addresses).collect()
             }
-            _ => at.iter().map(location_text).collect(),
-        };
-        let reach = match through {
-            None => "this host".to_owned(),
-            Some(gateway) => {
-                let link = link.map(|link| format!(", {}", security(link.encrypted)));
-                format!("via {}{}", escape_name(&gateway), link.unwrap_or_default())
-            }
+            _ => match link {
+                // The directory of the host has the locations of its gateway for it.
+                Some(link) => link.locations.iter().map(location_text).collect(),
+                None => at.iter().map(location_text).collect(),
+            },
         };
         let cells = [
             escape_name(&entry.name).into_owned(),
+            host(entry, at),
             escape(&entry.agent_type).into_owned(),
-            reach,
+            output::time_span(entry.registered.elapsed().unwrap_or_default()),
+            match &entry.role {
+                Role::Coalition(members) => match members.names().len() {
+                    1 => "1 member".to_owned(),
+                    count => format!("{count} members"),
+                },
+                _ => state(entry, link, has_report).to_owned(),
+            },
+        ];
+        let long_cells = [
             locations.join("\n"),
             escape_name(entry.mts.shown()).into_owned(),
             source(entry.source).to_owned(),
-            age(entry),
         ];
-        Self { cells, json }
+        Self {
+            cells,
+            long_cells,
+            json,
+        }
     }
+}
+
+/// The host of an agent as table text.
+fn host(entry: &Entry, at: &[Location]) -> String {
+    match (entry.reach, &entry.mts.name, at.first()) {
+        (Reach::Local, _, _) => "this host".to_owned(),
+        (Reach::Remote { .. }, Some(gateway), _) => escape_name(gateway).into_owned(),
+        (Reach::Remote { .. }, None, Some(location)) => location.host().to_owned(),
+        (Reach::Remote { .. }, None, None) => "(unknown)".to_owned(),
+    }
+}
+
+/// The state of an agent as table text.
+fn state(entry: &Entry, link: Option<&Connected>, has_report: bool) -> &'static str {
+    match entry.reach {
+        _ if entry.is_unsupported() => "unsupported",
+        Reach::Local if stopped_process(entry).is_some() => "stopped",
+        Reach::Local => "ready",
+        Reach::Remote { .. } => match link {
+            Some(link) => security(link.security.encrypted),
+            // A legacy peer keeps no connection.
+            None if is_legacy(entry) || !has_report => "",
+            None => "no connection",
+        },
+    }
+}
+
+/// The fingerprints of the trusted certificates; `None` without keys.
+fn trusted(config: &Config) -> Option<Vec<String>> {
+    let keys = Some(&config.security.keys).filter(|keys| !keys.is_empty())?;
+    let trusted = Keys::at(keys).trusted().ok()?.into_iter();
+    Some(trusted.map(|it| it.fingerprint().to_string()).collect())
+}
+
+/// The table cells of a lost host.
+fn lost_cells(host: &LostHost, trusted: Option<&[String]>) -> [String; 5] {
+    let name = escape_name(&host.name);
+    let since = output::time_span(Duration::from_secs(host.seconds));
+    let state = match (&host.certificate, trusted) {
+        (Some(certificate), Some(trusted)) if !trusted.contains(certificate) => {
+            "not trusted".to_owned()
+        }
+        _ => format!("lost {since} ago"),
+    };
+    let cells = [&*name, &*name, GATEWAY_TYPE, "-", &state];
+    cells.map(str::to_owned)
 }
 
 /// A location as table text.
@@ -431,11 +556,4 @@ fn source(source: Source) -> &'static str {
         Source::Contact => "contact",
         _ => "?",
     }
-}
-
-/// The time since registration in whole seconds. Zero if the clocks of the two hosts differ so much
-/// that the registration is in the future.
-fn age(entry: &Entry) -> String {
-    let age = entry.registered.elapsed().unwrap_or_default();
-    humantime::format_duration(Duration::from_secs(age.as_secs())).to_string()
 }

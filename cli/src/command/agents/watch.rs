@@ -198,7 +198,7 @@ fn print(
         let line = json!({ "time": time, "change": change.word(), "agent": row.json });
         return output::json_line(&line);
     }
-    let [name, agent_type, reach, locations, ..] = &row.cells;
+    let ([name, host, agent_type, ..], [locations, ..]) = (&row.cells, &row.long_cells);
     let agent_type = match agent_type.as_str() {
         "" => String::new(),
         agent_type => format!(" ({agent_type})"),
@@ -206,6 +206,6 @@ fn print(
     let locations = locations.replace('\n', " ");
     let change = change.word();
     output::text(&format!(
-        "{time}  {change:<7}  {name}{agent_type}  {reach}  {locations}\n"
+        "{time}  {change:<7}  {name}{agent_type}  {host}  {locations}\n"
     ))
 }

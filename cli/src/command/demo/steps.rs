@@ -4,6 +4,7 @@
 use std::io::Write as _;
 use std::time::{Duration, Instant};
 
+use anstyle::{AnsiColor, Style};
 use fipa_acl::escape;
 use serde_json::{Map, Value, json};
 use tokio::io::AsyncWriteExt;
@@ -42,6 +43,8 @@ pub(super) async fn run(verbose: bool) -> Result<Report, Failure> {
     let mut demo = Demo {
         processes,
         verbose,
+        color: output::has_color(),
+        step: "",
         steps: Vec::new(),
         broken: None,
     };
@@ -69,6 +72,9 @@ pub(super) async fn run(verbose: bool) -> Result<Report, Failure> {
 struct Demo {
     processes: Processes,
     verbose: bool,
+    color: bool,
+    /// The name of the current step.
+    step: &'static str,
     steps: Vec<Value>,
     broken: Option<String>,
 }
@@ -97,53 +103,81 @@ impl Demo {
         self.say(
             "Two domains on this machine stand for two robots; each domain has its own gateway.",
         );
+        self.begin("agents register and are listed");
         let found = self.listed().await;
-        if !self.step("agents register and are listed", found) {
+        if !self.end(found) {
             // The other steps need these agents.
             return;
         }
+        self.begin("a conversation on one host");
         let found = self.request("arm_1", "shm").await;
-        self.step("a conversation on one host", found);
+        self.end(found);
+        self.begin("the same conversation between two hosts");
         let found = self.request("crex_camera", "tcp").await;
-        self.step("the same conversation between two hosts", found);
+        self.end(found);
+        self.begin("large content without a copy");
         let found = self.large().await;
-        self.step("large content without a copy", found);
+        self.end(found);
+        self.begin("a multicast to arm_.*");
         let found = self.multicast().await;
-        self.step("a multicast to arm_.*", found);
+        self.end(found);
+        self.begin("an agent is killed");
         let found = self.killed().await;
-        self.step("an agent is killed", found);
+        self.end(found);
+        self.begin("fallback from shared memory to a Unix domain socket");
         let found = self.broken_memory().await;
-        self.step("fallback from shared memory to a Unix domain socket", found);
+        self.end(found);
+        self.begin("a letter from a legacy peer");
         let found = self.legacy_peer().await;
-        self.step("a letter from a legacy peer", found);
+        self.end(found);
+        self.begin("a protocol violation is detected");
         let found = self.broken_protocol().await;
-        self.step("a protocol violation is detected", found);
+        self.end(found);
+        self.begin("the lock of a killed agent, and its late command");
         let found = self.locks().await;
-        self.step("the lock of a killed agent, and its late command", found);
+        self.end(found);
+        self.begin("measurement");
         let found = self.measurement().await;
-        self.step("measurement", found);
+        self.end(found);
     }
 
     fn say(&self, text: &str) {
+        self.print(&output::printable(text));
+    }
+
+    /// Prints a text that is escaped, and may have colors.
+    fn print(&self, text: &str) {
         if self.verbose {
             // A closed standard output does not change the steps.
             let mut out = std::io::stdout().lock();
-            let text = output::printable(text);
             let _ = writeln!(out, "{text}").and_then(|()| out.flush());
         }
     }
 
-    /// Records and prints the result of a step. Returns whether the step passed.
-    fn step(&mut self, name: &str, found: Found) -> bool {
+    /// Prints the heading of the next step.
+    fn begin(&mut self, name: &'static str) {
+        let heading = format!("{}. {name}", self.steps.len() + 1);
+        self.print(&self.painted(Style::new().bold(), &heading));
+        self.step = name;
+    }
+
+    /// Records and prints the result of the step that began last. Returns whether the step passed.
+    fn end(&mut self, found: Found) -> bool {
         let (ok, mut object) = match found {
             Ok(found) => (true, found),
             Err(error) => (false, Map::from_iter([("error".to_owned(), json!(error))])),
         };
-        let number = self.steps.len() + 1;
-        self.say(&match object.get("error").and_then(Value::as_str) {
-            None => format!("  [ok] {number}. {name}\n"),
-            Some(error) => format!("  [FAILED] {number}. {name}: {}\n", escape(error)),
-        });
+        match object.get("error").and_then(Value::as_str) {
+            None => {
+                let ok = self.painted(AnsiColor::Green.on_default(), "[ok]");
+                self.print(&format!("  {ok}\n"));
+            }
+            Some(error) => {
+                let failed = self.painted(AnsiColor::Red.on_default().bold(), "[FAILED]");
+                self.print(&format!("  {failed} {}\n", escape(error)));
+            }
+        }
+        let name = self.step;
         object.insert("name".to_owned(), json!(name));
         object.insert("ok".to_owned(), json!(ok));
         self.steps.push(Value::Object(object));
@@ -151,6 +185,13 @@ impl Demo {
             self.broken = Some(name.to_owned());
         }
         ok
+    }
+
+    fn painted(&self, style: Style, text: &str) -> String {
+        match self.color {
+            true => format!("{style}{text}{style:#}"),
+            false => text.to_owned(),
+        }
     }
 
     async fn listed(&mut self) -> Found {
@@ -668,7 +709,8 @@ impl Demo {
                 first.display()
             )),
         };
-        self.step("no files are left behind", found);
+        self.begin("no files are left behind");
+        self.end(found);
     }
 }
 

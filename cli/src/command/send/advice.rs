@@ -1,11 +1,16 @@
 //! Remedies for messages that were not delivered.
 
+use std::sync::Arc;
+
 use fipa::error::SendError;
 use fipa::monitor::ViolationKind;
 use fipa::{Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, is_pattern};
 
+use fipa_acl::escape_name;
 use fipa_monitor::one_edit_apart;
 
+use crate::membership::stopped_process;
+use crate::output;
 use crate::report::Failure;
 
 /// One failure per reason, with the receivers that it concerns.
@@ -23,6 +28,12 @@ pub(super) fn failures(deliveries: &Deliveries, agent: &Agent, config: &Config) 
     let failure = |(reason, names): (FailureReason, Vec<&str>)| {
         let help = match reason {
             FailureReason::NoSuchAgent => no_such_agent(&names, agent, config),
+            FailureReason::Unreachable => {
+                lost_host(&names, agent).unwrap_or_else(|| advice(reason, config))
+            }
+            FailureReason::TimedOut | FailureReason::Unconfirmed | FailureReason::QueueFull => {
+                stopped(&names, agent).unwrap_or_else(|| advice(reason, config))
+            }
             other => advice(other, config),
         };
         Failure::failed(format!("not delivered: {reason}"), receivers(&names), help)
@@ -100,16 +111,48 @@ fn no_such_agent(names: &[&str], agent: &Agent, config: &Config) -> String {
     let gateway = entries.iter().find(|entry| entry.role == Role::Gateway);
     let domain = &config.domain;
     match gateway {
-        Some(gateway) => format!(
-            "`fipa agents` lists the agents of domain {domain:?}, and the agents on other hosts that \
-             gateway {:?} has discovered",
-            gateway.name
-        ),
+        Some(gateway) => {
+            let keys = match config.security.keys.is_empty() {
+                true => "",
+                false => "; agents of hosts that are not trusted are unknown (`fipa keys list`)",
+            };
+            format!(
+                "`fipa agents` lists the agents of domain {domain:?}, and the agents on other hosts that \
+                 gateway {:?} has discovered{keys}",
+                gateway.name
+            )
+        }
         None => format!(
             "`fipa agents` lists the agents of domain {domain:?}; no gateway is running on this host, \
              so agents on other hosts are unknown: start one with `fipa up`"
         ),
     }
+}
+
+/// The remedy if the process of one of these agents is stopped.
+fn stopped(names: &[&str], agent: &Agent) -> Option<String> {
+    let directory = agent.domain().directory();
+    let entries = names.iter().filter_map(|name| directory.known(name));
+    let (entry, process) = entries
+        .filter_map(|entry| Some((Arc::clone(&entry), stopped_process(&entry)?)))
+        .next()?;
+    Some(format!(
+        "the process {process} of {} is stopped, by SIGSTOP, Ctrl-Z or a debugger; continue it: `kill -CONT {process}`. \
+         It may then take the message, so ask it before sending the message again",
+        escape_name(&entry.name)
+    ))
+}
+
+/// The remedy if the host of one of these agents was connected, and is gone.
+fn lost_host(names: &[&str], agent: &Agent) -> Option<String> {
+    let directory = agent.domain().directory();
+    let lost = names.iter().find_map(|name| directory.lost_agent(name))?;
+    let since = output::time_span(lost.registered.elapsed().unwrap_or_default());
+    Some(format!(
+        "its host {} was last seen {since} ago: check that it is switched on and that `fipa up` runs there; \
+         `fipa doctor` shows refused connections",
+        escape_name(lost.mts.shown())
+    ))
 }
 
 fn advice(reason: FailureReason, config: &Config) -> String {
@@ -120,19 +163,19 @@ fn advice(reason: FailureReason, config: &Config) -> String {
                 .to_owned()
         }
         FailureReason::Unreachable => {
-            "see the attempts above; `fipa agents` shows the receiver's locations, and `fipa doctor` \
+            "see the attempts above; `fipa agents --long` shows the receiver's locations, and `fipa doctor` \
              checks the ports of known gateways"
                 .to_owned()
         }
         FailureReason::TooLarge => format!(
-            "split the message, or increase transport.shm.max_letter (now {} bytes here) in the \
+            "split the message, or increase transport.shm.max_letter (now {} here) in the \
              configuration of both hosts",
-            config.transport.shm.max_letter
+            output::size(config.transport.shm.max_letter)
         ),
         FailureReason::NoRoom => format!(
             "shared memory is used up by letters that agents keep, and by loans: release them, or raise \
-             transport.shm.capacity (now {} bytes here)",
-            config.transport.shm.capacity
+             transport.shm.capacity (now {} here)",
+            output::size(config.transport.shm.capacity)
         ),
         FailureReason::Inexpressible => {
             "change or omit the parameter named above, which the peer's dialect cannot encode"

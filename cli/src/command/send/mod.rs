@@ -14,10 +14,11 @@ use fipa::locks::{Fence, with_fences};
 use fipa::monitor::History;
 use fipa::protocol::{PartnerEvent, PartnerWatch};
 use fipa::{
-    Agent, AgentId, Config, Deliveries, DeliveryFailure, Incarnation, Incoming, Message,
-    Performative, RegisterOptions, Time,
+    Agent, AgentId, Config, Deliveries, Delivery, DeliveryFailure, Incarnation, Incoming, Matcher,
+    Message, Performative, RegisterOptions, Time,
 };
 use fipa_acl::json::message_to_json;
+use indicatif::{HumanBytes, ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
 use super::protocol;
@@ -73,7 +74,8 @@ JSON:
 
 With --count or --rate, one object on each line:
   { \"number\": of the message, from 1, \"deliveries\": as above }
-  { \"messages\": number, \"delivered\", \"sent\" and \"failed\": numbers of outcomes, \"seconds\": number }  at the end")]
+  { \"messages\": number, \"delivered\", \"sent\" and \"failed\": numbers of outcomes,
+    \"seconds\": number }  at the end")]
 pub(crate) struct Arguments {
     /// Name of the receiver, or a pattern such as 'arm_.*'; repeatable
     #[arg(long, value_name = "NAME", add = complete::agents())]
@@ -223,7 +225,7 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
     // Read before the domain is joined: input from a terminal can take long.
     let content = match (arguments.content.take(), &arguments.content_file) {
         (Some(text), _) => Some(text.into_bytes()),
-        (None, Some(file)) => Some(input::read(file, Message::MAX_CONTENT)?),
+        (None, Some(file)) => Some(input::content(file, &config)?),
         (None, None) => None,
     };
     let is_repeated = arguments.count.is_some() || arguments.rate.is_some();
@@ -298,6 +300,44 @@ async fn located(agent: &Agent, arguments: &Arguments) -> Result<Vec<AgentId>, F
     }
 }
 
+/// Content from this size is sent with a line that shows the progress, in bytes.
+const LARGE: usize = 1 << 20;
+
+/// A line for large content, which can take long over a network. It is not drawn when standard error is no
+/// terminal. It has no bar, because a transport does not report the bytes that have arrived.
+fn progress(size: usize, deadline: Duration) -> ProgressBar {
+    if size < LARGE {
+        return ProgressBar::hidden();
+    }
+    let progress = ProgressBar::new_spinner();
+    let style = ProgressStyle::with_template("{spinner} {msg}: {elapsed}");
+    progress.set_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()));
+    let deadline = humantime::format_duration(deadline);
+    progress.set_message(format!(
+        "sending {}, at most {deadline}",
+        HumanBytes(size as u64)
+    ));
+    progress.enable_steady_tick(Duration::from_millis(200));
+    progress
+}
+
+/// Sorts outcomes by the order in which the receivers were given. Members of coalitions are last.
+fn in_order_given(deliveries: &mut Deliveries, to: &[AgentId]) {
+    let names = to
+        .iter()
+        .map(|id| (id.name(), Matcher::parse(id.name()).ok()));
+    let names: Vec<(&str, Option<Matcher>)> = names.collect();
+    let place = |delivery: &Delivery| {
+        let receiver = &*delivery.receiver;
+        let is_named = |(name, matcher): &(&str, Option<Matcher>)| {
+            let is_match = |matcher: &Matcher| matcher.matches(receiver);
+            *name == receiver || matcher.as_ref().is_some_and(is_match)
+        };
+        names.iter().position(is_named).unwrap_or(names.len())
+    };
+    deliveries.0.sort_by_cached_key(place);
+}
+
 /// Sends the message, waits for the replies if requested, and prints the outcomes and the replies.
 async fn converse(
     agent: &Agent,
@@ -309,8 +349,14 @@ async fn converse(
     let deadline = arguments.deadline.unwrap_or(config.mts.deadline);
     // Before the message is sent, so that no departure is missed.
     let mut partners = agent.watch_partners();
+    let progress = progress(
+        message.content().map_or(0, |content| content.len()),
+        deadline,
+    );
     let sent = agent.send_within(message.clone(), deadline).await;
-    let deliveries = sent.map_err(|error| not_sent(&error))?;
+    progress.finish_and_clear();
+    let mut deliveries = sent.map_err(|error| not_sent(&error))?;
+    in_order_given(&mut deliveries, &arguments.to);
     if !arguments.json {
         output::text(&format!("{deliveries}\n"))?;
     }

@@ -8,7 +8,7 @@ use serde_json::json;
 use tokio::task::{JoinError, JoinSet};
 use tokio::time::Interval;
 
-use super::{Arguments, located, message, not_sent, register};
+use super::{Arguments, in_order_given, located, message, not_sent, register};
 use crate::membership::{self, Stop};
 use crate::options;
 use crate::output::{self, Reader};
@@ -107,7 +107,7 @@ async fn send_all(
             return Ok(());
         }
         tokio::select! {
-            Some(sent) = under_way.join_next() => tally.add(sent, arguments.json)?,
+            Some(sent) = under_way.join_next() => tally.add(sent, arguments)?,
             () = tick(&mut starts), if !is_over && under_way.len() < most => {
                 let (number, sending) = (next, agent.send_within(message.clone(), deadline));
                 under_way.spawn(async move { (number, sending.await) });
@@ -135,11 +135,13 @@ struct Tally {
 
 impl Tally {
     /// Counts the outcomes of a message. Prints those that failed, or all as JSON.
-    fn add(&mut self, sent: Result<Sent, JoinError>, json: bool) -> Result<(), Failure> {
+    fn add(&mut self, sent: Result<Sent, JoinError>, arguments: &Arguments) -> Result<(), Failure> {
+        let json = arguments.json;
         let Ok((number, sent)) = sent else {
             return Ok(());
         };
-        let deliveries = sent.map_err(|error| not_sent(&error))?;
+        let mut deliveries = sent.map_err(|error| not_sent(&error))?;
+        in_order_given(&mut deliveries, &arguments.to);
         self.messages += 1;
         if json {
             let deliveries = output::deliveries(&deliveries);

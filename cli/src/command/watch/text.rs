@@ -1,6 +1,5 @@
 //! Output of `fipa watch` as text.
 
-use std::io::IsTerminal;
 use std::time::SystemTime;
 
 use anstyle::{AnsiColor, Style};
@@ -33,11 +32,9 @@ pub(super) enum Ink {
 impl Look {
     pub(super) fn of_stdout() -> Self {
         let width = output::terminal_width();
-        let terminal = std::io::stdout().is_terminal();
-        let plain = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
         Self {
             width,
-            color: terminal && !plain,
+            color: output::has_color(),
         }
     }
 
