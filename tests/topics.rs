@@ -13,9 +13,13 @@ use std::time::Duration;
 use fipa::blocking::Wait;
 use fipa::protocol::{DialogueError, Keep, Notification};
 use fipa::topics::{NotificationResult, Publisher, Topic};
-use fipa::{Agent, Config, Domain, Performative};
+use fipa::{Agent, Config, Domain, Gateway, Kind, Performative};
 use fipa_testbed::{ignored_test, send_signal, until_async};
 use support::{config, load, mark};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::time::Instant;
 
 /// Time limit of all calls, which a passing test does not reach.
 const TIMEOUT: Duration = Duration::from_secs(60);
@@ -321,4 +325,91 @@ async fn a_program_that_does_not_read_keeps_the_newest_and_other_messages_arrive
     assert!(numbers.len() < 1_000, "{} were kept", numbers.len());
     assert!(numbers.ends_with(&[1_998, 1_999, 2_000]), "{numbers:?}");
     assert!(images.rate().unwrap() > 0.0);
+}
+
+/// Forwards connections to a gateway, each byte after this delay. Returns its address.
+async fn distance(to: String, delay: Duration) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let at = listener.local_addr().unwrap().to_string();
+    tokio::spawn(async move {
+        loop {
+            let (near, _) = listener.accept().await.unwrap();
+            let Ok(far) = TcpStream::connect(&to).await else {
+                continue;
+            };
+            let ((near_in, near_out), (far_in, far_out)) = (near.into_split(), far.into_split());
+            tokio::spawn(delayed(near_in, far_out, delay));
+            tokio::spawn(delayed(far_in, near_out, delay));
+        }
+    });
+    at
+}
+
+async fn delayed(mut from: OwnedReadHalf, mut to: OwnedWriteHalf, delay: Duration) {
+    let (sender, mut receiver) = tokio::sync::mpsc::unbounded_channel();
+    tokio::spawn(async move {
+        while let Some((due, bytes)) = receiver.recv().await {
+            tokio::time::sleep_until(due).await;
+            let bytes: Vec<u8> = bytes;
+            if to.write_all(&bytes).await.is_err() {
+                return;
+            }
+        }
+    });
+    let mut bytes = vec![0; 64 << 10];
+    while let Ok(len @ 1..) = from.read(&mut bytes).await {
+        let _ = sender.send((Instant::now() + delay, bytes[..len].to_vec()));
+    }
+}
+
+/// One image under way would be one image per round trip.
+#[tokio::test(flavor = "multi_thread")]
+async fn two_images_are_under_way_to_a_distant_viewer() {
+    let near_config = config(&[]);
+    let near = Gateway::open(&near_config).await.unwrap();
+    let at = |gateway: &Gateway| {
+        let locations = gateway.locations();
+        let tcp = locations.iter().find(|it| it.kind() == Kind::Tcp).unwrap();
+        tcp.address().to_owned()
+    };
+    let address = distance(at(&near), Duration::from_millis(100)).await;
+    let peer = format!("discovery.static={{ \"near\" = [\"tcp://{address}\"] }}");
+    let far_config = config(&[&peer]);
+    let far = Gateway::open(&far_config).await.unwrap();
+    let there = Domain::open(&far_config).await.unwrap();
+    let here = Domain::open(&near_config).await.unwrap();
+    let camera = there.register("camera").await.unwrap();
+    let viewer = here.register("viewer").await.unwrap();
+    let operator = there.register("operator").await.unwrap();
+    let images = camera.publisher(Topic::new("image").rate(100.0)).unwrap();
+    until_async("the viewer knows the camera", || {
+        viewer.domain().directory().lookup("camera").is_some()
+    })
+    .await;
+    let mut seen = subscribed(&viewer, Keep::Auto, "image").await.unwrap();
+    let mut numbers = Vec::new();
+    let watch = async {
+        loop {
+            let status = operator.topics_of(camera.id()).await.unwrap();
+            // Two under way, and the newest one.
+            if status[0].first_subscribers[0].waiting == 3 {
+                break;
+            }
+        }
+    };
+    tokio::select! {
+        watched = tokio::time::timeout(TIMEOUT, watch) => watched.unwrap(),
+        () = async {
+            loop {
+                images.publish(vec![7; 1000]).await;
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        } => {}
+        () = async {
+            loop {
+                numbers.push(seen.next().await.unwrap().number().unwrap());
+            }
+        } => {}
+    }
+    assert!(numbers.is_sorted(), "{numbers:?}");
 }

@@ -1,17 +1,19 @@
 //! Publishers: the participant of all subscriptions to one topic.
 //!
 //! Each subscriber has a task and a queue of its own, so a slow one delays no other. One notification is under way to
-//! each; the queue has those that wait. The queue of a subscriber that keeps the newest `n` never has more.
+//! each, or two to a distant one; the queue has those that wait. The queue of a subscriber that keeps the newest `n` never
+//! has more.
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt;
 use std::pin::Pin;
 use std::sync::{Arc, Weak};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use fipa_acl::{ErrorChain, Message, Performative, escape_name};
 use fipa_mts::core::MAX_DEADLINE;
+use fipa_sds::Reach;
 use fipa_transport::{FailureReason, LoanedContent, Outcome, log_limit};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, oneshot};
@@ -141,8 +143,8 @@ struct Subscriber {
     name: String,
     keep: Keep,
     waiting: VecDeque<Waiting>,
-    /// Whether a notification is under way.
-    is_busy: bool,
+    /// Number of notifications that are under way.
+    under_way: u64,
     /// Notified when a sample is added.
     added: Arc<Notify>,
     /// Numbers of notifications by their result.
@@ -386,6 +388,13 @@ impl Shared {
         }
     }
 
+    /// Time between two notifications, as far as it is known.
+    fn period(&self) -> Option<Duration> {
+        let hertz = self.topic.rate;
+        let hertz = hertz.or_else(|| self.state.lock().measured_rate.hertz(Instant::now()))?;
+        Duration::try_from_secs_f64(1.0 / hertz).ok()
+    }
+
     /// Adds a subscriber, which gets the latched samples.
     fn register(&self, name: String, keep: Keep) -> (u64, Arc<Notify>) {
         let mut state = self.state.lock();
@@ -395,7 +404,7 @@ impl Shared {
             name,
             keep,
             waiting: VecDeque::new(),
-            is_busy: false,
+            under_way: 0,
             added: Arc::default(),
             delivered: 0,
             replaced: 0,
@@ -422,7 +431,7 @@ impl Shared {
         let subscriber = state.subscribers.get_mut(&number)?;
         let was_full = subscriber.is_full(is_stream);
         let next = subscriber.waiting.pop_front();
-        subscriber.is_busy = next.is_some();
+        subscriber.under_way += u64::from(next.is_some());
         let keep = subscriber.effective_keep(is_stream);
         drop(state);
         if was_full {
@@ -435,7 +444,7 @@ impl Shared {
     fn count(&self, number: u64, outcome: &Outcome) {
         let mut state = self.state.lock();
         if let Some(subscriber) = state.subscribers.get_mut(&number) {
-            subscriber.is_busy = false;
+            subscriber.under_way = subscriber.under_way.saturating_sub(1);
             match outcome.is_success() {
                 true => subscriber.delivered += 1,
                 false => subscriber.fail(outcome.to_string()),
@@ -517,7 +526,7 @@ impl Subscriber {
             delivered: self.delivered,
             replaced: self.replaced,
             failed: self.failed,
-            waiting: self.waiting.len() as u64 + u64::from(self.is_busy),
+            waiting: self.waiting.len() as u64 + self.under_way,
             last_failure: self.last_failure.clone(),
         }
     }
@@ -594,8 +603,15 @@ async fn serve(
         Some(keep) => agree.user_defined(DELIVERY, keep.to_string()),
         None => agree,
     };
+    let begun = Instant::now();
     let served = match dialogue.say(agree, None).await {
-        Ok(()) => notify(&mut dialogue, first, shared, number, &added).await,
+        Ok(()) => {
+            let distance = Distance {
+                is_remote: is_remote(core, first),
+                round_trip: begun.elapsed(),
+            };
+            notify(&mut dialogue, first, shared, number, &added, distance).await
+        }
         Err(error) => Err(error),
     };
     if let Some(shared) = shared.upgrade() {
@@ -607,8 +623,36 @@ async fn serve(
 /// The content of the `failure`, or of the `refuse`, at the end of a publisher.
 const ENDED: &str = "the publisher has ended";
 
+/// The way to a subscriber.
+#[derive(Debug, Clone, Copy)]
+struct Distance {
+    /// Whether it is on another host.
+    is_remote: bool,
+    /// The shortest time from a notification, or from the `agree`, to its outcome.
+    round_trip: Duration,
+}
+
+impl Distance {
+    /// Returns the number of notifications that may be under way. With one, a subscriber gets one notification per
+    /// round trip. A second one fills the way if the round trip is longer than the period of the topic. Over a thin link
+    /// it would only wait behind the first one; there the short `agree` shows that the round trip is short.
+    fn max_under_way(self, period: Option<Duration>) -> usize {
+        match period {
+            Some(period) if self.is_remote && self.round_trip > period => 2,
+            _ => 1,
+        }
+    }
+}
+
+/// Whether the sender of a message is an agent of another host.
+fn is_remote(core: &AgentCore, message: &Message) -> bool {
+    let entry = core.endpoint.domain.directory().known(&name_of(message));
+    entry.is_some_and(|entry| entry.reach != Reach::Local)
+}
+
 /// A notification that was sent.
 struct UnderWay {
+    begun: Instant,
     outcomes: Pin<Box<dyn Future<Output = Deliveries> + Send>>,
     result: Option<oneshot::Sender<NotificationResult>>,
 }
@@ -619,13 +663,21 @@ async fn notify(
     shared: &Weak<Shared>,
     number: u64,
     added: &Notify,
+    mut distance: Distance,
 ) -> Result<(), DialogueError> {
-    let mut under_way: Option<UnderWay> = None;
+    let mut under_way: VecDeque<UnderWay> = VecDeque::new();
+    let mut has_ended = false;
     loop {
-        let (outcomes, is_free) = match &mut under_way {
-            Some(sent) => (Some(&mut sent.outcomes), false),
-            None => (None, true),
+        let is_free = match under_way.len() {
+            _ if has_ended => false,
+            0 => true,
+            sent => sent < distance.max_under_way(shared.upgrade().and_then(|it| it.period())),
         };
+        if has_ended && under_way.is_empty() {
+            dialogue.take_speaker().abandon(first, ENDED);
+            return Ok(());
+        }
+        let oldest = under_way.front_mut().map(|sent| &mut sent.outcomes);
         tokio::select! {
             // A cancel precedes the notifications that wait.
             biased;
@@ -638,9 +690,12 @@ async fn notify(
                 Ok(_) | Err(DialogueError::Violation { .. } | DialogueError::Undelivered(_)) => {}
                 Err(error) => return Err(error),
             },
-            deliveries = finished(outcomes) => {
+            deliveries = finished(oldest) => {
                 dialogue.settle(&deliveries);
-                let result = under_way.take().and_then(|sent| sent.result);
+                let sent = under_way.pop_front();
+                let round_trip = sent.as_ref().map_or(Duration::MAX, |sent| sent.begun.elapsed());
+                distance.round_trip = distance.round_trip.min(round_trip);
+                let result = sent.and_then(|sent| sent.result);
                 let Some(delivery) = deliveries.0.into_iter().next() else {
                     continue;
                 };
@@ -662,16 +717,16 @@ async fn notify(
             }
             next = next_sample(shared, number, added), if is_free => {
                 let Some((waiting, keep)) = next else {
-                    dialogue.take_speaker().abandon(first, ENDED);
-                    return Ok(());
+                    has_ended = true;
+                    continue;
                 };
-                under_way = Some(send(dialogue, first, waiting, keep)?);
+                under_way.push_back(send(dialogue, first, waiting, keep)?);
             }
         }
     }
 }
 
-/// Waits for the outcomes of the notification that is under way.
+/// Waits for the outcomes of the oldest notification that is under way.
 async fn finished(
     outcomes: Option<&mut Pin<Box<dyn Future<Output = Deliveries> + Send>>>,
 ) -> Deliveries {
@@ -712,7 +767,30 @@ fn send(
         _ => dialogue.post(notification, None)?,
     };
     Ok(UnderWay {
+        begun: Instant::now(),
         outcomes: Box::pin(deliveries(sent)),
         result,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_notifications_are_under_way_if_one_would_leave_a_distant_way_empty() {
+        let most = |is_remote, round_trip, period| {
+            let round_trip = Duration::from_millis(round_trip);
+            let distance = Distance {
+                is_remote,
+                round_trip,
+            };
+            distance.max_under_way(Option::map(period, Duration::from_millis))
+        };
+        assert_eq!(most(true, 100, Some(33)), 2);
+        assert_eq!(most(true, 10, Some(33)), 1);
+        assert_eq!(most(true, 100, None), 1);
+        // A subscriber on this host that is slow, or stopped.
+        assert_eq!(most(false, 100, Some(33)), 1);
+    }
 }
