@@ -375,7 +375,7 @@ async fn two_images_are_under_way_to_a_distant_viewer() {
     let address = distance(at(&near), Duration::from_millis(100)).await;
     let peer = format!("discovery.static={{ \"near\" = [\"tcp://{address}\"] }}");
     let far_config = config(&[&peer]);
-    let far = Gateway::open(&far_config).await.unwrap();
+    let _far = Gateway::open(&far_config).await.unwrap();
     let there = Domain::open(&far_config).await.unwrap();
     let here = Domain::open(&near_config).await.unwrap();
     let camera = there.register("camera").await.unwrap();
