@@ -315,6 +315,13 @@ fn topics_lists_topics_with_their_rates_and_subscribers() {
     for part in ["text/plain", "(100)", "fipa-subscribe-", "latest(1)"] {
         assert!(one.contains(part), "{one}");
     }
+    viewer.send_signal("-STOP");
+    let stopped = host.run(&["topics", "camera"]).done();
+    assert!(stopped.contains("is stopped; `kill -CONT"), "{stopped}");
+    let stopped: Value =
+        serde_json::from_str(&host.run(&["topics", "camera", "--json"]).done()).unwrap();
+    assert!(stopped[0]["topics"][0]["first_subscribers"][0]["stopped"].is_u64());
+    viewer.send_signal("-CONT");
     let watched = host.run(&["topics", "--watch", "--for", "2s"]).done();
     assert!(watched.matches("AGENT").count() > 1, "{watched}");
     let unknown = host.run(&["topics", "nobody"]).failed(1);
@@ -370,6 +377,20 @@ fn the_receiver_and_the_content_of_send_need_no_options() {
     let twice = host.run(&["send", "--to", "arm_1", "hello"]).failed(2);
     assert!(twice.contains("fipa send NAME TEXT"), "{twice}");
     host.run(&["send"]).failed(2);
+}
+
+#[test]
+fn content_that_is_no_text_is_not_printed() {
+    let host = Host::new();
+    let file = host.path("image");
+    fs::write(&file, [255; 300]).unwrap();
+    let publish = ["publish", "camera", "image", "--content-file"];
+    let _camera = host.start(&[&publish[..], &[file.to_str().unwrap()]].concat());
+    let seen = host.run(&["subscribe", "camera", "image", "--count", "1"]);
+    assert_eq!(
+        seen.done(),
+        "300 bytes that are no text; --raw prints them\n"
+    );
 }
 
 #[test]

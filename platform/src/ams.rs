@@ -11,8 +11,8 @@ use fipa_content::{Content, SlDialect, Term, Wff};
 use crate::description::{AMS_DESCRIPTION, CONSTRAINTS, Constraints, matches_agent};
 use crate::df::{authorize, result};
 use crate::exception::Exception;
+use crate::matching::max_results;
 use crate::request::{self, Rejection, Request};
-use crate::search::max_results;
 use crate::stored::{StoredDescription, Text, lease_left, read_object};
 use crate::{
     AddressBook, AgentState, AmsDescription, ApDescription, Asker, Platform, PlatformAnswer,

@@ -11,9 +11,9 @@ use fipa_content::{Content, SlDialect, Term, Wff};
 
 use crate::description::{Constraints, described};
 use crate::exception::Exception;
+use crate::matching::{Comparisons, max_results};
 use crate::remote::{self, LocalEntry, RemoteEntry};
 use crate::request::{self, Rejection, Request};
-use crate::search::{Comparisons, max_results};
 use crate::stored::{StoredDescription, StoredSubscription, Text, lease_left, read_object};
 use crate::subscription::{Subscription, checked_template};
 use crate::{

@@ -141,6 +141,8 @@ struct Sample {
 #[derive(Debug)]
 struct Subscriber {
     name: String,
+    /// Whether it is on another host.
+    is_remote: bool,
     keep: Keep,
     waiting: VecDeque<Waiting>,
     /// Number of notifications that are under way.
@@ -264,16 +266,13 @@ impl Publisher {
     /// never delays the call. One that asks for all, or is a partner that cannot ask, and has 64 that wait, delays it
     /// for at most [`Topic::wait_for_slow`], and does not delay the other subscribers.
     pub async fn publish(&self, content: impl Into<Bytes>) -> Publication {
-        let content: Bytes = content.into();
-        let content = match self.subscribers() {
-            0 | 1 => content,
-            _ => self
-                .core
-                .endpoint
-                .mts()
-                .shared_content(&content)
-                .unwrap_or(content),
-        };
+        let mut content: Bytes = content.into();
+        // Each subscriber of another host gets a copy in any case.
+        if self.shared.state.lock().on_this_host() > 1
+            && let Some(shared) = self.core.endpoint.mts().shared_content(&content)
+        {
+            content = shared;
+        }
         self.hand_over(content).await
     }
 
@@ -396,12 +395,13 @@ impl Shared {
     }
 
     /// Adds a subscriber, which gets the latched samples.
-    fn register(&self, name: String, keep: Keep) -> (u64, Arc<Notify>) {
+    fn register(&self, name: String, is_remote: bool, keep: Keep) -> (u64, Arc<Notify>) {
         let mut state = self.state.lock();
         state.last_subscriber += 1;
         let number = state.last_subscriber;
         let mut subscriber = Subscriber {
             name,
+            is_remote,
             keep,
             waiting: VecDeque::new(),
             under_way: 0,
@@ -482,6 +482,12 @@ impl TopicSource for Shared {
 }
 
 impl State {
+    /// Returns the number of subscribers on this host.
+    fn on_this_host(&self) -> usize {
+        let subscribers = self.subscribers.values();
+        subscribers.filter(|it| !it.is_remote).count()
+    }
+
     /// Whether the next sample has room in each queue.
     fn has_room(&self) -> bool {
         let mut subscribers = self.subscribers.values();
@@ -595,7 +601,8 @@ async fn serve(
     let asked = Keep::of(first);
     // Registered before the `agree`: the subscriber gets each notification that is published after it has
     // received the `agree`.
-    let (number, added) = registered.register(name_of(first), asked.unwrap_or(Keep::All));
+    let (name, is_remote) = (name_of(first), is_remote(core, first));
+    let (number, added) = registered.register(name, is_remote, asked.unwrap_or(Keep::All));
     drop(registered);
     let agree = core.endpoint.reply(first, Performative::Agree).content("");
     let agree = match asked {
@@ -607,7 +614,7 @@ async fn serve(
     let served = match dialogue.say(agree, None).await {
         Ok(()) => {
             let distance = Distance {
-                is_remote: is_remote(core, first),
+                is_remote,
                 round_trip: begun.elapsed(),
             };
             notify(&mut dialogue, first, shared, number, &added, distance).await

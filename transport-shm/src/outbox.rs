@@ -17,7 +17,6 @@ use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, PortFact
 use parking_lot::{Mutex, MutexGuard};
 use smallvec::SmallVec;
 
-use crate::content::{ContentWrite, write};
 use crate::counters::{Tally, count, count_alone};
 use crate::domain_files::DomainFiles;
 use crate::errors::{
@@ -31,6 +30,7 @@ use crate::layout::{
 };
 use crate::loan::{Loan, ShmLoan};
 use crate::memory::{Budget, populate, shortage_error};
+use crate::parcel_writer::{ContentWrite, write};
 use crate::pool::Pool;
 use crate::presence::{AnswerPlace, StatusPage, WordLender};
 use crate::storage;

@@ -28,6 +28,9 @@ Examples:
   fipa echo arm_1 --type arm --description 'left front'
   fipa echo arm_1 --count 1          ends after one message
 
+To print the values of a topic:
+  fipa subscribe camera image
+
 In another terminal:
   fipa send --to arm_1 --content hello --wait")]
 pub(crate) struct Arguments {

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use clap::Args;
 use fipa::error::ErrorChain;
 use fipa::topics::{NotificationResult, Notified, Publication, Publisher, Topic};
-use fipa::{Agent, AgentId, Domain, Message, RegisterOptions};
+use fipa::{Agent, AgentId, Config, Domain, RegisterOptions};
 use fipa_acl::{escape, escape_name};
 use serde_json::json;
 use tokio::sync::mpsc;
@@ -90,7 +90,8 @@ const MAX_LINE: u64 = 1 << 20;
 /// The values that are published.
 enum Values {
     One(Bytes),
-    File(PathBuf),
+    /// A file that is read for each publication, and the configuration with the limit of its length.
+    File(PathBuf, Box<Config>),
     Lines(mpsc::Receiver<io::Result<Vec<u8>>>),
 }
 
@@ -103,11 +104,17 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         };
         membership::register(domain, arguments.name.name(), options, &config).await
     };
-    let publish = async |agent: &Agent, stop: &mut Stop| publish(agent, &arguments, stop).await;
+    let publish =
+        async |agent: &Agent, stop: &mut Stop| publish(agent, &arguments, &config, stop).await;
     membership::run_agent(&config, register, publish)
 }
 
-async fn publish(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result<(), Failure> {
+async fn publish(
+    agent: &Agent,
+    arguments: &Arguments,
+    config: &Config,
+    stop: &mut Stop,
+) -> Result<(), Failure> {
     let mut topic = Topic::new(arguments.topic.clone()).latched(1);
     if let Some(media_type) = &arguments.media_type {
         topic = topic.media_type(media_type);
@@ -134,9 +141,9 @@ async fn publish(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Resul
     }
     let mut values = match (&arguments.value, &arguments.content_file) {
         (_, Some(file)) if file == Path::new("-") => {
-            Values::One(input::read(file, Message::MAX_CONTENT)?.into())
+            Values::One(input::content(file, config)?.into())
         }
-        (_, Some(file)) => Values::File(file.clone()),
+        (_, Some(file)) => Values::File(file.clone(), Box::new(config.clone())),
         (Some(value), None) if value == "-" => Values::Lines(lines_of_input()?),
         (value, None) => Values::One(value.clone().unwrap_or_default().into()),
     };
@@ -246,7 +253,7 @@ impl Values {
     async fn next(&mut self) -> Result<Option<Bytes>, Failure> {
         match self {
             Self::One(value) => Ok(Some(value.clone())),
-            Self::File(file) => Ok(Some(input::read(file, Message::MAX_CONTENT)?.into())),
+            Self::File(file, config) => Ok(Some(input::content(file, config)?.into())),
             Self::Lines(lines) => match lines.recv().await {
                 Some(line) => Ok(Some(line.map_err(|error| cannot_read(&error))?.into())),
                 None => Ok(None),

@@ -39,7 +39,8 @@ pub(crate) struct Arguments {
     #[arg(add = complete::agents())]
     name: AgentId,
 
-    /// Content of the subscription: for an agent of this project, the topic of the publisher
+    /// Topic of the publisher; for an agent of another platform, the content of the subscription
+    #[arg(value_name = "TOPIC")]
     content: String,
 
     /// Notifications to get if this command is slower than the publisher: all, latest(N), or auto, which is the newest one of
@@ -155,6 +156,12 @@ fn print(notification: &Notification, arguments: &Arguments) -> Result<(), Failu
     }
     output::text(&match arguments.full {
         true => format!("{notification}\n"),
-        false => format!("{}\n", escape(&String::from_utf8_lossy(content))),
+        false => match std::str::from_utf8(content) {
+            Ok(text) => format!("{}\n", escape(text)),
+            Err(_) => format!(
+                "{} bytes that are no text; --raw prints them\n",
+                content.len()
+            ),
+        },
     })
 }

@@ -25,10 +25,16 @@ use crate::report::Failure;
 /// List the topics of agents, with their rates and subscribers
 ///
 /// Without an agent, all agents of this host and of connected hosts are listed that publish topics. Without a gateway,
-/// all agents of this host are asked. With an agent, each subscriber is listed, too, with its counts and its last
-/// failure: they show why one of them gets nothing.
+/// all agents of this host are asked. With an agent, each subscriber is listed, too: they show why one of them gets
+/// nothing.
 ///
-/// RATE is measured over the last 32 values; the declared rate is in parentheses. BYTES is the length of the newest value.
+/// TYPE is the media type that the publisher declares. RATE is measured over the last 32 values; the declared rate is in
+/// parentheses. BYTES is the length of the newest value.
+///
+/// KEEP shows the values that a subscriber gets if it is slower than the publisher: all, or the newest ones. DELIVERED
+/// counts values that are in the queue of the subscriber, REPLACED those that a newer one replaced before they left, FAILED
+/// those that were lost. WAITING counts the values on their way and those that wait to leave. STATE is `stopped` for a
+/// process of this host that does not run, for example after Ctrl-Z.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -43,8 +49,8 @@ The values of a topic:
 JSON, with --watch one array on each line:
   [ { \"agent\": name, \"topics\": null if the agent does not answer, or [ { \"name\", \"media_type\", \"rate\": declared,
       \"measured_rate\", \"published\": number, \"bytes\", \"subscribers\": number,
-      \"first_subscribers\": [ { \"name\", \"keep\", \"delivered\", \"replaced\", \"failed\", \"waiting\",
-      \"last_failure\" } ] } ] } ]")]
+      \"first_subscribers\": [ { \"name\", \"stopped\": process or null, \"keep\", \"delivered\", \"replaced\",
+      \"failed\", \"waiting\", \"last_failure\" } ] } ] } ]")]
 pub(crate) struct Arguments {
     /// Name of the agent [default: all agents that publish topics]
     #[arg(add = complete::agents())]
@@ -78,9 +84,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         return membership::run(async {
             let domain = membership::join(&config).await?;
             let listed = async {
-                let agent = asking(&domain, "topics", &config).await?;
-                let listed = list(&Arc::new(agent), &arguments, &config).await?;
-                print(&listed, &arguments)
+                let agent = Arc::new(asking(&domain, "topics", &config).await?);
+                let listed = list(&agent, &arguments, &config).await?;
+                print(&agent, &listed, &arguments)
             };
             let listed = listed.await;
             domain.close().await;
@@ -96,7 +102,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             loop {
                 turns.tick().await;
                 let listed = list(&agent, &arguments, &config).await?;
-                print(&listed, &arguments)?;
+                print(&agent, &listed, &arguments)?;
             }
         };
         tokio::select! {
@@ -174,11 +180,19 @@ async fn ask_all(agent: &Arc<Agent>, publishers: impl Iterator<Item = AgentId>) 
     listed
 }
 
-fn print(listed: &Listed, arguments: &Arguments) -> Result<(), Failure> {
+fn print(agent: &Agent, listed: &Listed, arguments: &Arguments) -> Result<(), Failure> {
+    let stopped = |subscriber: &SubscriberStatus| {
+        let entry = agent.domain().directory().lookup(&subscriber.name)?;
+        membership::stopped_process(&entry)
+    };
     if arguments.json {
         let agents = listed.iter().map(|(agent, topics)| {
             let topics = topics.as_ref();
-            let topics = topics.map(|all| all.iter().map(status).collect::<Vec<Value>>());
+            let topics = topics.map(|all| {
+                all.iter()
+                    .map(|it| status(it, stopped))
+                    .collect::<Vec<Value>>()
+            });
             json!({ "agent": agent, "topics": topics })
         });
         let agents: Vec<Value> = agents.collect();
@@ -224,39 +238,49 @@ fn print(listed: &Listed, arguments: &Arguments) -> Result<(), Failure> {
     if arguments.agent.is_some() {
         let topics = listed.values().flatten().flatten();
         for topic in topics.filter(|topic| !topic.first_subscribers.is_empty()) {
-            let _ = write!(text, "\n{}", subscribers(topic));
+            let _ = write!(text, "\n{}", subscribers(topic, stopped));
         }
     }
     output::text(&text)
 }
 
 /// The subscribers of a topic, in a table.
-fn subscribers(topic: &TopicStatus) -> String {
+fn subscribers(topic: &TopicStatus, stopped: impl Fn(&SubscriberStatus) -> Option<u32>) -> String {
     let mut text = format!("subscribers to {}:\n", escape(&topic.name));
     let mut table = output::table([
         "SUBSCRIBER",
+        "STATE",
         "KEEP",
         "DELIVERED",
         "REPLACED",
         "FAILED",
         "WAITING",
     ]);
-    let mut failures = String::new();
+    let mut reasons = String::new();
     for subscriber in &topic.first_subscribers {
         let name = escape_name(&subscriber.name);
+        let process = stopped(subscriber);
+        let state = process.map_or("", |_| "stopped");
         table.add_row([
             name.clone().into_owned(),
+            state.to_owned(),
             escape(&subscriber.keep).into_owned(),
             subscriber.delivered.to_string(),
             subscriber.replaced.to_string(),
             subscriber.failed.to_string(),
             subscriber.waiting.to_string(),
         ]);
+        if let Some(process) = process {
+            let _ = writeln!(
+                reasons,
+                "{name}: its process {process} is stopped; `kill -CONT {process}` continues it"
+            );
+        }
         if let Some(failure) = &subscriber.last_failure {
-            let _ = writeln!(failures, "last failure of {name}: {}", escape(failure));
+            let _ = writeln!(reasons, "{name}: last failure: {}", escape(failure));
         }
     }
-    let _ = write!(text, "{table}\n{failures}");
+    let _ = write!(text, "{table}\n{reasons}");
     let listed = topic.first_subscribers.len() as u64;
     if topic.subscribers > listed {
         let _ = writeln!(text, "and {} more", topic.subscribers - listed);
@@ -275,11 +299,11 @@ fn rate(topic: &TopicStatus) -> String {
     }
 }
 
-fn status(topic: &TopicStatus) -> Value {
+fn status(topic: &TopicStatus, stopped: impl Fn(&SubscriberStatus) -> Option<u32>) -> Value {
     let subscriber = |it: &SubscriberStatus| {
         json!({
-            "name": it.name, "keep": it.keep, "delivered": it.delivered, "replaced": it.replaced,
-            "failed": it.failed, "waiting": it.waiting, "last_failure": it.last_failure,
+            "name": it.name, "stopped": stopped(it), "keep": it.keep, "delivered": it.delivered,
+            "replaced": it.replaced, "failed": it.failed, "waiting": it.waiting, "last_failure": it.last_failure,
         })
     };
     let first: Vec<Value> = topic.first_subscribers.iter().map(subscriber).collect();
@@ -296,13 +320,18 @@ fn failed(error: &TopicsError, agent: &AgentId, config: &Config) -> Failure {
         other => fipa::error::ErrorChain(other).to_string(),
     };
     let help = match error {
-        TopicsError::Dialogue(DialogueError::TimedOut | DialogueError::NotUnderstood(_)) => {
+        TopicsError::Dialogue(DialogueError::TimedOut | DialogueError::NotUnderstood(_))
+        | TopicsError::Parse(_)
+        | TopicsError::Read(_) => {
             "the agent may publish no topics; `fipa topics` lists the agents that do"
         }
-        _ => "check with `fipa agents` whether the agent is known",
+        _ => "`fipa agents` shows whether the agent is known, and whether its process is stopped",
     };
     Failure::failed(
-        format!("{} tells no topics: {problem}", escape_name(agent.name())),
+        format!(
+            "no list of topics from {}: {problem}",
+            escape_name(agent.name())
+        ),
         format!("domain {}", config.domain),
         help,
     )

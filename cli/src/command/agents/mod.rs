@@ -47,7 +47,7 @@ Columns:
              legacy peer its address
   AGE        time since its registration
   STATE      ready         on this host
-             stopped       on this host, and its process is stopped
+             stopped       on this host, and its process is stopped, for example by Ctrl-Z
              encrypted, not encrypted
                            the connection with its host; `fipa routes` has its
                            certificate
@@ -75,6 +75,7 @@ JSON:
                   \"locations\": [ text ], \"unsupported_transports\": [ transport ], if no
                   location has a supported one, \"mts\": { \"name\", \"incarnation\" },
                   \"incarnation\", \"registered\": time, \"source\": as above,
+                  \"stopped\": the process, if it is stopped,
                   \"addresses\": [ text ], those of the gateway of this host for platforms } ],
     \"lost\": [ { \"name\", \"seconds\" since it was last seen,
                 \"certificate\": fingerprint or null } ] }
@@ -411,6 +412,9 @@ impl Row {
             "registered": registered.ok().and_then(Time::to_rfc3339),
             "source": entry.source,
         });
+        if let Some(process) = stopped_process(entry) {
+            json["stopped"] = process.into();
+        }
         let link = reported.links.get(&entry.mts.incarnation);
         if let Some(gateway) = &through {
             json["gateway"] = gateway.as_str().into();

@@ -9,18 +9,19 @@
 //! letter.
 //!
 //! This module dispatches letters; [`answers`] handles answers and reports, [`clock`] timeouts,
-//! [`custody`] predecessors at custodians, [`open_letter`] the state of one letter, [`turns`] the times
-//! at which it may be dispatched, [`pause`] letters that came back, [`tried`] the attempts that are
+//! [`predecessors`] letters that wait at custodians, [`open_letter`] the state of one letter, [`turns`] the times
+//! at which it may be dispatched, [`pause`] letters that came back, [`failed_routes`] the attempts that are
 //! reported for letters that were never dispatched, [`trust`] withdrawn certificates.
 //!
 //! [`rules`]: super::rules
 
 mod answers;
 mod clock;
+mod failed_routes;
 mod open_letter;
 mod pause;
 mod predecessors;
-mod tried;
+
 mod trust;
 mod turns;
 
