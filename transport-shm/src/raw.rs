@@ -174,15 +174,19 @@ impl RawNode {
             .max_subscribers(subscribers)
             .max_nodes(subscribers + 1)
             .subscriber_max_buffer_size(WAITING)
+            .subscriber_max_borrowed_samples(1)
             .enable_safe_overflow(false)
             .create()
             .map_err(cannot("create the service"))?;
+        // All subscribers share the samples that wait, so fewer chunks are in use than iceoryx2 prepares for.
+        let chunks = WAITING + subscribers + LOANS;
         let publisher = service
             .publisher_builder()
             .initial_max_slice_len(FIRST)
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .max_loaned_samples(LOANS)
+            .override_sample_preallocation(move |_| chunks)
             .create()
             .map_err(cannot("create the publisher"))?;
         let event = self
@@ -198,6 +202,7 @@ impl RawNode {
             publisher,
             notifier: notifier.map_err(cannot("create the notifier"))?,
             subscribers,
+            chunks,
             room: AtomicUsize::new(FIRST),
             budget: &self.budget,
         })
@@ -381,6 +386,8 @@ pub struct RawPublisher<'a> {
     notifier: Notifier<Svc>,
     /// Number of subscribers that each sample must reach.
     subscribers: usize,
+    /// Number of samples that a segment has room for.
+    chunks: usize,
     /// Length in bytes of the longest payload that fits the current segment.
     room: AtomicUsize,
     budget: &'a Budget,
@@ -392,7 +399,7 @@ impl RawPublisher<'_> {
     /// # Errors
     /// Returns an error if memory is short.
     pub fn loan(&self, len: usize) -> Result<RawSampleLoan, RawError> {
-        check_room(&self.room, self.budget, len, WAITING + LOANS)?;
+        check_room(&self.room, self.budget, len, self.chunks)?;
         let loan = self.publisher.loan_slice_uninit(len);
         let loan = loan.map_err(cannot("loan memory"))?;
         // SAFETY: every byte of the payload is initialized by the kernel or by an earlier sample,
