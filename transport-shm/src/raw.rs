@@ -2,9 +2,9 @@
 //! publish-subscribe.
 //!
 //! A request goes to another process in shared memory and an answer comes back. A sample goes to all
-//! subscribers, which do not answer. There is no directory and no envelope. The end of a peer is not detected, files of killed processes are not
-//! cleaned up, and memory is bounded only by the size of `/dev/shm`, which is checked before a
-//! larger segment is created. Feature `raw`.
+//! subscribers, which do not answer. There is no directory and no envelope. The end of a peer is not
+//! detected, files of killed processes are not cleaned up, and memory is bounded only by the size of
+//! `/dev/shm`, which is checked before a larger segment is created. Feature `raw`.
 
 use std::fmt;
 use std::hint::spin_loop;
