@@ -11,6 +11,7 @@
 //! * [`Paper`] repeats the evaluation of the C++ libraries: lengths and times of all encodings.
 //! * [`Peers`] measures conversations with an agent of JADE, beside those of another JADE platform.
 //! * [`Locks`] measures locks, beside the same letters sent by hand.
+//! * [`Topics`] measures publications to several subscribers, beside publish-subscribe of iceoryx2 and zenoh.
 //! * [`Machine`] describes the machine that was measured.
 //!
 //! The crate has no argument parser and prints nothing; `fipa bench` is its shell.
@@ -30,6 +31,7 @@ mod peers;
 mod plot;
 mod report;
 mod stage;
+mod topics;
 
 pub use baseline::{Baseline, Changes};
 pub use comparison::{Comparison, Measurement, Program, Selection};
@@ -40,3 +42,4 @@ pub use measure::Effort;
 pub use paper::Paper;
 pub use part::play;
 pub use peers::{Conversations, Peers, PeersReport};
+pub use topics::{Topics, TopicsReport};

@@ -103,6 +103,7 @@ async fn turn(stage: &mut Stage, ends: Ends, what: Spread, size: usize) -> Resul
         size,
         fill: Fill::Filled,
         window: 1,
+        pause_us: 0,
     };
     let receives = what != Spread::Fill;
     if receives {

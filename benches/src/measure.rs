@@ -249,6 +249,7 @@ async fn cell(
         size,
         fill,
         window,
+        pause_us: 0,
     };
     for round in 0..=effort.rounds + effort.rate_rounds {
         for (index, path) in paths.iter().enumerate() {

@@ -243,6 +243,7 @@ impl BenchPath {
             size,
             fill: Fill::Copied,
             window: 1,
+            pause_us: 0,
         };
         stage.tell(self.sender, &Order::Send(one)).await?;
         stage.event(self.sender).await?;

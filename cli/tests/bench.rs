@@ -196,6 +196,32 @@ fn locks_need_the_letters_of_their_algorithm() {
 }
 
 #[test]
+fn publications_for_1_4_and_16_subscribers_are_measured() {
+    let child = bench(&["topics", "--quick", "--json"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let pid = child.id();
+    let output = child.wait_with_output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(report["notes"], serde_json::json!([]), "{report:#}");
+    let rows = report["rows"].as_array().unwrap();
+    let subscribers: Vec<f64> = rows.iter().map(|row| number(&row["subscribers"])).collect();
+    assert_eq!(subscribers, [1.0, 4.0, 16.0]);
+    for row in rows {
+        for measured in ["fipa_us", "iceoryx2_us", "ratio", "cpu_us"] {
+            assert!(number(&row[measured]) > 0.0, "{row:#}");
+        }
+        assert!(row["zenoh_us"].is_null(), "{row:#}");
+    }
+    assert_eq!(files(pid), Vec::<String>::new());
+    assert_eq!(processes(pid), 0);
+}
+
+#[test]
 fn locks_of_a_wrong_number_of_agents_are_refused() {
     for (arguments, expected) in [
         (["locks", "--agents", "1"], "locks of 1 agents"),
@@ -340,12 +366,14 @@ fn the_evaluation_of_the_paper_is_repeated() {
 
 #[test]
 fn invalid_options_have_exit_code_2() {
-    let cases: [(&[&str], &str); 5] = [
+    let cases: [(&[&str], &str); 7] = [
         (&["shm", "--sizes", "1GiB"], "--sizes"),
         (&["shm", "--dir", "/tmp"], "--dir"),
         (&["paper", "--svg", "/dev/null"], "--svg"),
         (&["paper", "--baseline", "/dev/null"], "--baseline"),
         (&["paper", "--dir", "/nowhere"], "--dir"),
+        (&["topics", "--svg", "/dev/null"], "--svg"),
+        (&["topics", "--baseline", "/dev/null"], "--baseline"),
     ];
     for (arguments, wrong) in cases {
         let output = bench(arguments).output().unwrap();

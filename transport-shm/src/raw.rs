@@ -1,9 +1,10 @@
-//! Bare iceoryx2 request-response with the settings of this transport, for comparison in benches.
+//! Bare iceoryx2 with the settings of this transport, for comparison in benches: request-response and
+//! publish-subscribe.
 //!
-//! A request goes to another process in shared memory and an answer comes back. There is no
-//! directory and no envelope. The end of a peer is not detected, files of killed processes are not
-//! cleaned up, and memory is bounded only by the size of `/dev/shm`, which is checked before a
-//! larger segment is created. Feature `raw`.
+//! A request goes to another process in shared memory and an answer comes back. A sample goes to all
+//! subscribers, which do not answer. There is no directory and no envelope. The end of a peer is not
+//! detected, files of killed processes are not cleaned up, and memory is bounded only by the size of
+//! `/dev/shm`, which is checked before a larger segment is created. Feature `raw`.
 
 use std::fmt;
 use std::hint::spin_loop;
@@ -15,11 +16,15 @@ use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::Client;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::server::Server;
+use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::{
     AllocationStrategy, BackpressureStrategy, ServiceName, SignalHandlingMode, ipc_threadsafe,
 };
 use iceoryx2::request_mut::RequestMut;
+use iceoryx2::sample::Sample;
+use iceoryx2::sample_mut::SampleMut;
 
 use crate::layout::{self, Ack};
 use crate::memory::Budget;
@@ -34,10 +39,13 @@ type Answer = [u8; size_of::<Ack>()];
 /// Number of requests of one client that may be unanswered.
 pub const WINDOW: usize = 16;
 
-/// Number of loans that a client can have in addition.
+/// Number of loans that a client can have in addition, and of a publisher.
 const LOANS: usize = 2;
 
-/// Length in bytes of requests in the first segment.
+/// Number of samples that wait for a subscriber before [`RawPublisher::send`] fails.
+const WAITING: usize = 64;
+
+/// Length in bytes of requests and samples in the first segment.
 const FIRST: usize = 4096;
 
 /// The method of waiting.
@@ -153,6 +161,78 @@ impl RawNode {
         })
     }
 
+    /// Creates the publishing side, for at most this number of subscribers. A name can have one.
+    ///
+    /// # Errors
+    /// Returns an error if an iceoryx2 operation fails.
+    pub fn publish(&self, name: &str, subscribers: usize) -> Result<RawPublisher<'_>, RawError> {
+        let service = self
+            .node
+            .service_builder(&service_name(name, "samples")?)
+            .publish_subscribe::<[u8]>()
+            .max_publishers(1)
+            .max_subscribers(subscribers)
+            .max_nodes(subscribers + 1)
+            .subscriber_max_buffer_size(WAITING)
+            .subscriber_max_borrowed_samples(1)
+            .enable_safe_overflow(false)
+            .create()
+            .map_err(cannot("create the service"))?;
+        // All subscribers share the samples that wait, so fewer chunks are in use than iceoryx2 prepares for.
+        let chunks = WAITING + subscribers + LOANS;
+        let publisher = service
+            .publisher_builder()
+            .initial_max_slice_len(FIRST)
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .max_loaned_samples(LOANS)
+            .override_sample_preallocation(move |_| chunks)
+            .create()
+            .map_err(cannot("create the publisher"))?;
+        let event = self
+            .node
+            .service_builder(&service_name(name, "samples")?)
+            .event()
+            .max_listeners(subscribers)
+            .max_nodes(subscribers + 1)
+            .create()
+            .map_err(cannot("create the event"))?;
+        let notifier = event.notifier_builder().create();
+        Ok(RawPublisher {
+            publisher,
+            notifier: notifier.map_err(cannot("create the notifier"))?,
+            subscribers,
+            chunks,
+            room: AtomicUsize::new(FIRST),
+            budget: &self.budget,
+        })
+    }
+
+    /// Creates a subscribing side.
+    ///
+    /// # Errors
+    /// Returns an error if an iceoryx2 operation fails or this name has no publisher.
+    pub fn subscribe(&self, name: &str) -> Result<RawSubscriber, RawError> {
+        let service = self
+            .node
+            .service_builder(&service_name(name, "samples")?)
+            .publish_subscribe::<[u8]>()
+            .open()
+            .map_err(cannot("open the service"))?;
+        let subscriber = service.subscriber_builder().create();
+        let event = self
+            .node
+            .service_builder(&service_name(name, "samples")?)
+            .event()
+            .open()
+            .map_err(cannot("open the event"))?;
+        let listener = event.listener_builder().create();
+        Ok(RawSubscriber {
+            subscriber: subscriber.map_err(cannot("create the subscriber"))?,
+            listener: listener.map_err(cannot("create the listener"))?,
+        })
+    }
+
     /// The events of one side: the one it waits for, and the one that it notifies.
     fn events(
         &self,
@@ -246,14 +326,7 @@ impl RawClient<'_> {
     /// # Errors
     /// Returns an error if too many requests are out, or memory is short.
     pub fn loan(&self, len: usize) -> Result<RawLoan, RawError> {
-        if len > self.room.load(Ordering::Relaxed) {
-            let room = len.next_power_of_two();
-            // Every chunk may be written later, and a full file system would then end the process.
-            let most = room.saturating_mul(4 * WINDOW + LOANS);
-            let need = u64::try_from(most).unwrap_or(u64::MAX);
-            self.budget.check(need).map_err(cannot("allocate memory"))?;
-            self.room.store(room, Ordering::Relaxed);
-        }
+        check_room(&self.room, self.budget, len, 4 * WINDOW + LOANS)?;
         let loan = self.client.loan_slice_uninit(len);
         let loan = loan.map_err(cannot("loan memory"))?;
         // SAFETY: every byte of the payload is initialized by the kernel or by an earlier request,
@@ -305,6 +378,112 @@ impl RawLoan {
 /// A sent request.
 #[derive(Debug)]
 pub struct RawPending(PendingResponse<Svc, [u8], Header, Answer, ()>);
+
+/// The side that sends samples to all subscribers.
+#[derive(Debug)]
+pub struct RawPublisher<'a> {
+    publisher: Publisher<Svc, [u8], ()>,
+    notifier: Notifier<Svc>,
+    /// Number of subscribers that each sample must reach.
+    subscribers: usize,
+    /// Number of samples that a segment has room for.
+    chunks: usize,
+    /// Length in bytes of the longest payload that fits the current segment.
+    room: AtomicUsize,
+    budget: &'a Budget,
+}
+
+impl RawPublisher<'_> {
+    /// Loans memory for a sample. Its content is arbitrary.
+    ///
+    /// # Errors
+    /// Returns an error if memory is short.
+    pub fn loan(&self, len: usize) -> Result<RawSampleLoan, RawError> {
+        check_room(&self.room, self.budget, len, self.chunks)?;
+        let loan = self.publisher.loan_slice_uninit(len);
+        let loan = loan.map_err(cannot("loan memory"))?;
+        // SAFETY: every byte of the payload is initialized by the kernel or by an earlier sample,
+        // because it is memory of a shared mapping, and every value is a valid `u8`.
+        Ok(RawSampleLoan(unsafe { loan.assume_init() }))
+    }
+
+    /// Sends a sample to all subscribers, and wakes them if they block.
+    ///
+    /// # Errors
+    /// Returns an error if a subscriber does not get the sample.
+    pub fn send(&self, loan: RawSampleLoan, wait: Wait) -> Result<(), RawError> {
+        let receivers = loan.0.send().map_err(cannot("publish"))?;
+        if receivers != self.subscribers {
+            return Err(cannot("publish")(
+                "a subscriber is absent or has a full queue",
+            ));
+        }
+        notify(&self.notifier, wait)
+    }
+}
+
+/// Memory for a sample.
+#[derive(Debug)]
+pub struct RawSampleLoan(SampleMut<Svc, [u8], ()>);
+
+impl RawSampleLoan {
+    /// The writable payload.
+    pub fn content_mut(&mut self) -> &mut [u8] {
+        self.0.payload_mut()
+    }
+}
+
+/// A side that receives samples.
+#[derive(Debug)]
+pub struct RawSubscriber {
+    subscriber: Subscriber<Svc, [u8], ()>,
+    listener: Listener<Svc>,
+}
+
+impl RawSubscriber {
+    /// Waits for the next sample.
+    ///
+    /// # Errors
+    /// Returns an error if an iceoryx2 operation fails.
+    pub fn receive(&self, wait: Wait) -> Result<RawSample, RawError> {
+        loop {
+            let sample = self.subscriber.receive();
+            if let Some(sample) = sample.map_err(cannot("receive a sample"))? {
+                return Ok(RawSample(sample));
+            }
+            pause(&self.listener, wait)?;
+        }
+    }
+}
+
+/// A received sample.
+#[derive(Debug)]
+pub struct RawSample(Sample<Svc, [u8], ()>);
+
+impl RawSample {
+    /// The payload, in the publisher's memory.
+    #[must_use]
+    pub fn payload(&self) -> &[u8] {
+        self.0.payload()
+    }
+}
+
+/// Checks that the file system has memory for a segment with this number of chunks, if `len` needs a larger one.
+fn check_room(
+    room: &AtomicUsize,
+    budget: &Budget,
+    len: usize,
+    chunks: usize,
+) -> Result<(), RawError> {
+    if len > room.load(Ordering::Relaxed) {
+        let larger = len.next_power_of_two();
+        // Every chunk may be written later, and a full file system would then end the process.
+        let need = u64::try_from(larger.saturating_mul(chunks)).unwrap_or(u64::MAX);
+        budget.check(need).map_err(cannot("allocate memory"))?;
+        room.store(larger, Ordering::Relaxed);
+    }
+    Ok(())
+}
 
 fn pause(listener: &Listener<Svc>, wait: Wait) -> Result<(), RawError> {
     match wait {

@@ -1,4 +1,4 @@
-//! Bare iceoryx2: a request, and its response as the acknowledgment.
+//! Bare iceoryx2: a request, and its response as the acknowledgment; and samples for subscribers.
 
 use std::collections::VecDeque;
 use std::ffi::OsStr;
@@ -7,7 +7,9 @@ use std::path::PathBuf;
 use fipa::Config;
 use fipa_transport::Incarnation;
 use fipa_transport_shm::ShmConfig;
-use fipa_transport_shm::raw::{RawClient, RawNode, RawPending, RawServer, Wait};
+use fipa_transport_shm::raw::{
+    RawClient, RawNode, RawPending, RawPublisher, RawServer, RawSubscriber, Wait,
+};
 
 use super::orders::{
     End, Fill, Letters, Peer, Sent, byte_of, check, execute_orders, now_ns, to_text,
@@ -34,6 +36,20 @@ pub(super) fn play(config: &Config, end: End, wait: Wait) -> Result<(), String> 
             execute_orders(&mut sender, String::new());
         }
     }
+    Ok(())
+}
+
+/// Publishes to this number of subscribers, which block.
+pub(super) fn publish(config: &Config, subscribers: usize) -> Result<(), String> {
+    let node = node(config)?;
+    let publisher = node.publish(NAME, subscribers).map_err(to_text)?;
+    execute_orders(&mut Publisher { publisher }, String::new());
+    Ok(())
+}
+
+pub(super) fn subscribe(config: &Config) -> Result<(), String> {
+    let subscriber = node(config)?.subscribe(NAME).map_err(to_text)?;
+    execute_orders(&mut Subscriber { subscriber }, String::new());
     Ok(())
 }
 
@@ -130,6 +146,42 @@ impl Peer for Sender<'_> {
             self.end(&rest, &mut sent)?;
         }
         Ok(sent)
+    }
+}
+
+struct Publisher<'a> {
+    publisher: RawPublisher<'a>,
+}
+
+impl Peer for Publisher<'_> {
+    /// A sample is not acknowledged: its end is that of the call.
+    fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
+        let mut sent = Sent::with_room(letters);
+        for number in 0..letters.count {
+            std::thread::sleep(letters.pause());
+            sent.began.push(now_ns());
+            let mut loan = self.publisher.loan(letters.size).map_err(to_text)?;
+            loan.content_mut().fill(byte_of(number));
+            self.publisher.send(loan, Wait::Block).map_err(to_text)?;
+            sent.ended.push(now_ns());
+        }
+        Ok(sent)
+    }
+}
+
+struct Subscriber {
+    subscriber: RawSubscriber,
+}
+
+impl Peer for Subscriber {
+    fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
+        let mut at = Vec::with_capacity(letters.count);
+        for number in 0..letters.count {
+            let sample = self.subscriber.receive(Wait::Block).map_err(to_text)?;
+            at.push(now_ns());
+            check(sample.payload(), letters, number)?;
+        }
+        Ok(at)
     }
 }
 

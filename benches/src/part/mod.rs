@@ -11,6 +11,7 @@ mod locks;
 mod orders;
 mod relay;
 mod socket;
+mod topics;
 mod watcher;
 mod wire;
 
@@ -50,6 +51,14 @@ pub(super) enum Part {
     Letters { end: End },
     /// Bare iceoryx2.
     Iceoryx { end: End, wait: Wait },
+    /// An agent that publishes a topic.
+    Publisher,
+    /// An agent with this index that subscribes to the topic.
+    Subscriber { index: usize },
+    /// Bare iceoryx2 publish-subscribe: the publisher for this number of subscribers.
+    IceoryxPublisher { subscribers: usize },
+    /// A subscriber of bare iceoryx2.
+    IceoryxSubscriber,
     /// A bare socket; the address comes with the first order of the end that connects.
     Socket { end: End, kind: Socket },
     /// Between bare iceoryx2 and a bare connection.
@@ -65,8 +74,15 @@ impl Part {
             | Self::Iceoryx { end, .. }
             | Self::Socket { end, .. } => Some(*end),
             Self::Crowd { .. } => Some(End::Receiver),
-            // More agents than processors take part.
-            Self::Locks(_) | Self::Watcher | Self::Gateway | Self::Relay { .. } => None,
+            // More processes than processors take part.
+            Self::Locks(_)
+            | Self::Watcher
+            | Self::Publisher
+            | Self::Subscriber { .. }
+            | Self::IceoryxPublisher { .. }
+            | Self::IceoryxSubscriber
+            | Self::Gateway
+            | Self::Relay { .. } => None,
         }
     }
 }
@@ -171,6 +187,10 @@ fn play_part(part: Part, config: &Config) -> Result<(), String> {
         Part::Gateway => agent::gateway(config),
         Part::Letters { end } => letters::play(config, end),
         Part::Iceoryx { end, wait } => iceoryx::play(config, end, wait.into()),
+        Part::Publisher => topics::publish(config),
+        Part::Subscriber { index } => topics::subscribe(config, index),
+        Part::IceoryxPublisher { subscribers } => iceoryx::publish(config, subscribers),
+        Part::IceoryxSubscriber => iceoryx::subscribe(config),
         Part::Socket { end, kind } => socket::play(end, kind),
         Part::Relay { end, wire } => relay::play(config, end, wire),
     }

@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::io::Write as _;
+use std::time::Duration;
 
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
@@ -50,6 +51,15 @@ pub(crate) struct Letters {
     pub(crate) fill: Fill,
     /// Maximum number of letters without an acknowledgment.
     pub(crate) window: usize,
+    /// Pause before each publication of a topic, in microseconds.
+    #[serde(default)]
+    pub(crate) pause_us: u64,
+}
+
+impl Letters {
+    pub(crate) fn pause(&self) -> Duration {
+        Duration::from_micros(self.pause_us)
+    }
 }
 
 /// A step of sending to many receivers.

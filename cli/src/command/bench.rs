@@ -10,7 +10,7 @@ use fipa::error::ErrorChain;
 use fipa::{AgentId, Config, Incarnation, RegisterOptions};
 use fipa_bench::{
     Baseline, BenchError, Changes, Comparison, Effort, Locks, LocksReport, Machine, Measurement,
-    Paper, Peers, Program, Selection,
+    Paper, Peers, Program, Selection, Topics, TopicsReport,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -31,6 +31,10 @@ use crate::{membership, output};
 /// through the gateways of two hosts, beside the same letters sent by hand between the same processes;
 /// the hand-over from a holder to the next waiter; and the memory and idle load of 1,000 resources.
 ///
+/// `topics` measures publications of 1 MB from one process to 1, 4 and 16 subscribers, beside raw iceoryx2
+/// publish-subscribe, and beside the shared memory of zenoh with --zenoh. All processes sleep between two
+/// publications.
+///
 /// On a busy machine the times are unreliable; the ratios are less affected.
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -44,6 +48,8 @@ Examples:
   fipa bench paper --dir docs
   fipa bench locks --quick
   fipa bench locks --agents 2,16 --json | jq '.rows[] | {algorithm, agents, hosts, letters, ratio}'
+  fipa bench topics --zenoh benches/comparison/zenoh/target/release/fipa-comparison-zenoh
+  fipa bench topics --json | jq '.rows[] | {subscribers, fipa_us, ratio}'
   fipa bench peers --jade http://127.0.0.1:7777/acc --jade-asker http://127.0.0.1:7776/acc")]
 pub(crate) struct Arguments {
     /// Part to measure [default: shm and net]
@@ -64,7 +70,7 @@ pub(crate) struct Arguments {
     /// Take fewer samples: a few seconds, with a larger spread
     #[arg(long)]
     quick: bool,
-    /// Content sizes; not used by `paper` and `locks`
+    /// Content sizes; not used by `paper`, `locks` and `topics`
     #[arg(
         long,
         value_delimiter = ',',
@@ -120,6 +126,8 @@ enum What {
     Peers,
     /// Locks of up to 32 agents, beside the same letters sent by hand
     Locks,
+    /// Publications of 1 MB for up to 16 subscribers, beside raw iceoryx2 and zenoh
+    Topics,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -140,6 +148,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             ));
         }
         (Some(What::Paper), _) => return measure_paper(&arguments),
+        (Some(What::Topics), None) => return measure_topics(&arguments),
         (Some(What::Peers), Some(jade)) => return measure_peers(&arguments, jade, &config),
         (Some(What::Peers), None) => {
             return Err(Failure::wrong_usage(
@@ -284,6 +293,41 @@ fn measure_locks(arguments: &Arguments, baseline: Option<Baseline>) -> Result<()
             text: &|| measured.to_text(),
         },
     )
+}
+
+/// Measures publications for several subscribers.
+fn measure_topics(arguments: &Arguments) -> Result<(), Failure> {
+    let options = [
+        ("--svg", arguments.svg.is_some()),
+        ("--baseline", arguments.baseline.is_some()),
+        ("--dir", arguments.dir.is_some()),
+    ];
+    if let Some((option, _)) = options.into_iter().find(|(_, is_given)| *is_given) {
+        return Err(Failure::wrong_usage(
+            format!("`fipa bench topics` has no {option}"),
+            option,
+            format!("omit {option} or `topics`"),
+        ));
+    }
+    let mut topics = match arguments.quick {
+        true => Topics::quick(this_program()?),
+        false => Topics::full(this_program()?),
+    };
+    topics.zenoh = arguments.zenoh.as_deref().map(program).transpose()?;
+    let measured: TopicsReport = membership::run(async {
+        let machine = observe().await;
+        let progress = progress(topics.steps());
+        let measured = topics.run(machine, |step| advance(&progress, step)).await;
+        progress.finish_and_clear();
+        measured.map_err(failed)
+    })?;
+    for note in measured.notes() {
+        fipa::log_limit::info!("{note}");
+    }
+    match arguments.json {
+        true => output::json(&measured.to_json()),
+        false => output::text(&measured.to_text()),
+    }
 }
 
 async fn measure(comparison: Comparison) -> Result<Measurement, Failure> {

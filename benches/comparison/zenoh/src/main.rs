@@ -2,7 +2,8 @@
 //!
 //! It executes the same orders as the processes of `fipa bench` itself. A letter is a publication; an
 //! empty publication in return acknowledges it. The peers are connected directly over TCP on the
-//! loopback interface, with or without zenoh's shared memory.
+//! loopback interface, with or without zenoh's shared memory. A sender connects to one receiver or several:
+//! the order to find them has their addresses, separated by commas.
 
 use std::sync::mpsc::{Receiver as Queue, Sender as Into, channel};
 use std::time::{Duration, Instant};
@@ -67,14 +68,18 @@ fn main() -> Result<(), String> {
     Ok(())
 }
 
-/// Opens a session that listens on or connects to one address, without scouting.
-fn open(how: &str, address: &str, shared_memory: bool) -> Result<Session, String> {
+/// Opens a session that listens on or connects to addresses, without scouting. They are separated by commas.
+fn open(how: &str, addresses: &str, shared_memory: bool) -> Result<Session, String> {
     let mut config = Config::default();
+    let addresses: Vec<String> = addresses.split(',').map(|it| format!("\"{it}\"")).collect();
     let other = if how == "listen" { "connect" } else { "listen" };
     for (key, value) in [
         ("mode", "\"peer\"".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
-        (&format!("{how}/endpoints"), format!("[\"{address}\"]")),
+        (
+            &format!("{how}/endpoints"),
+            format!("[{}]", addresses.join(",")),
+        ),
         (&format!("{other}/endpoints"), "[]".to_owned()),
         ("transport/shared_memory/enabled", shared_memory.to_string()),
     ] {
@@ -143,6 +148,7 @@ struct Sender {
 }
 
 struct Connected {
+    receivers: usize,
     letters: Publisher<'static>,
     answered: Queue<u64>,
     memory: Option<ShmProvider<PosixShmProviderBackend>>,
@@ -151,8 +157,9 @@ struct Connected {
 }
 
 impl Connected {
-    fn to(address: &str, shared_memory: bool) -> Result<Self, String> {
-        let session = open("connect", address, shared_memory)?;
+    /// Connects to the receivers at these addresses.
+    fn to(addresses: &str, shared_memory: bool) -> Result<Self, String> {
+        let session = open("connect", addresses, shared_memory)?;
         let (into, answered) = channel();
         let answers = session
             .declare_subscriber(ANSWERS)
@@ -169,6 +176,7 @@ impl Connected {
             None
         };
         let connected = Self {
+            receivers: addresses.split(',').count(),
             letters: publisher(&session, LETTERS)?,
             answered,
             memory,
@@ -179,18 +187,20 @@ impl Connected {
         Ok(connected)
     }
 
-    /// Sends greetings until the receiver answers: then both subscriptions are active.
+    /// Sends greetings until all receivers answer one: then all subscriptions are active.
     fn greet(&self) -> Result<(), String> {
         let until = Instant::now() + STEP_TIMEOUT;
         while Instant::now() < until {
             self.letters.put(ZBytes::new()).wait().map_err(to_text)?;
-            if self.answered.recv_timeout(GREETING_INTERVAL).is_ok() {
-                // Discards late answers to earlier greetings.
-                while self.answered.recv_timeout(GREETING_INTERVAL * 4).is_ok() {}
+            let answer = || self.answered.recv_timeout(GREETING_INTERVAL);
+            let is_complete = (0..self.receivers).all(|_| answer().is_ok());
+            // Discards late answers.
+            while self.answered.recv_timeout(GREETING_INTERVAL * 4).is_ok() {}
+            if is_complete {
                 return Ok(());
             }
         }
-        Err("no answer from the receiver".to_owned())
+        Err("no answer from a receiver".to_owned())
     }
 
     /// Creates the content of a letter and records its start time.
@@ -223,8 +233,13 @@ impl Connected {
         Ok(loan.into())
     }
 
+    /// Waits for as many answers as one letter gets. Returns the time of the last one.
     fn answer(&self) -> Result<u64, String> {
-        self.answered.recv_timeout(STEP_TIMEOUT).map_err(to_text)
+        let mut last = 0;
+        for _ in 0..self.receivers {
+            last = self.answered.recv_timeout(STEP_TIMEOUT).map_err(to_text)?;
+        }
+        Ok(last)
     }
 }
 
@@ -241,6 +256,7 @@ impl Peer for Sender {
             while sent.began.len() - sent.ended.len() >= letters.window {
                 sent.ended.push(connected.answer()?);
             }
+            std::thread::sleep(letters.pause());
             let content = connected.content(letters, number, &mut sent.began)?;
             connected.letters.put(content).wait().map_err(to_text)?;
         }
