@@ -316,9 +316,9 @@ fn measure_topics(arguments: &Arguments) -> Result<(), Failure> {
     topics.zenoh = arguments.zenoh.as_deref().map(program).transpose()?;
     let measured: TopicsReport = membership::run(async {
         let machine = observe().await;
-        let progress = progress(topics.steps());
-        let measured = topics.run(machine, |step| advance(&progress, step)).await;
-        progress.finish_and_clear();
+        let progress = Progress::new(topics.steps());
+        let measured = topics.run(machine, |step| progress.begin(step)).await;
+        progress.end();
         measured.map_err(failed)
     })?;
     for note in measured.notes() {
