@@ -229,15 +229,32 @@ impl<A: Send + 'static> Running<A> {
     }
 }
 
-impl Peer for Running<Agent> {
-    /// The runtime runs meanwhile, so the agent answers at any time.
-    fn next_order(&mut self) -> Option<String> {
+/// Agents that read orders from standard input.
+pub(super) trait Ordered: Send + 'static {
+    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>>;
+}
+
+impl<A: Ordered> Running<A> {
+    /// Reads the next order. The runtime runs meanwhile, so the agents answer at any time.
+    pub(super) fn read_order(&mut self) -> Option<String> {
         self.run(|mut agent| async move {
-            let line = agent.orders.next_line().await;
+            let line = agent.orders().next_line().await;
             (agent, line)
         })
         .ok()?
         .ok()?
+    }
+}
+
+impl Ordered for Agent {
+    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>> {
+        &mut self.orders
+    }
+}
+
+impl Peer for Running<Agent> {
+    fn next_order(&mut self) -> Option<String> {
+        self.read_order()
     }
 
     fn find(&mut self, to: &str) -> Result<(), String> {

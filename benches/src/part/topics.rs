@@ -7,7 +7,7 @@ use fipa::topics::{Publisher, Topic};
 use fipa::{AgentId, Config, Domain, Performative, protocol::Subscription};
 use tokio::io::{BufReader, Lines, Stdin};
 
-use super::agent::{Running, orders, runtime};
+use super::agent::{Ordered, Running, orders, runtime};
 use super::orders::{Letters, Peer, Sent, byte_of, check, execute_orders, now_ns};
 use crate::error::chain_text;
 
@@ -93,15 +93,15 @@ impl Publishing {
     }
 }
 
+impl Ordered for Publishing {
+    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>> {
+        &mut self.orders
+    }
+}
+
 impl Peer for Running<Publishing> {
-    /// The runtime runs meanwhile, so the agent accepts subscriptions at any time.
     fn next_order(&mut self) -> Option<String> {
-        self.run(|mut agent| async move {
-            let line = agent.orders.next_line().await;
-            (agent, line)
-        })
-        .ok()?
-        .ok()?
+        self.read_order()
     }
 
     fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
@@ -150,15 +150,15 @@ impl Subscribing {
     }
 }
 
+impl Ordered for Subscribing {
+    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>> {
+        &mut self.orders
+    }
+}
+
 impl Peer for Running<Subscribing> {
-    /// The runtime runs meanwhile, so the agent answers at any time.
     fn next_order(&mut self) -> Option<String> {
-        self.run(|mut agent| async move {
-            let line = agent.orders.next_line().await;
-            (agent, line)
-        })
-        .ok()?
-        .ok()?
+        self.read_order()
     }
 
     fn find(&mut self, to: &str) -> Result<(), String> {
