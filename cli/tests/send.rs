@@ -494,7 +494,7 @@ fn a_signal_during_the_wait_for_a_reply_leaves_no_files() {
         output.starts_with("error: canceled by a signal before the command was done\n"),
         "{output}"
     );
-    assert_eq!(echo.signal("-HUP"), (Some(0), String::new()));
+    assert_eq!(echo.signal("-TERM"), (Some(0), String::new()));
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
 }
 

@@ -129,13 +129,16 @@ impl UnixTransport {
 
     /// Whether other processes find the socket. False when another program has removed it or the
     /// directory. A socket that cannot be examined counts as present, and so does the socket of an
-    /// endpoint that does not listen.
+    /// endpoint that does not listen or closes.
     #[must_use]
     pub fn is_there(&self) -> bool {
         let bound = self.bound.lock();
-        bound
+        let is_there = bound
             .as_ref()
-            .is_none_or(|bound| bound.directory.is_there(&self.name(), bound.file))
+            .is_none_or(|bound| bound.directory.is_there(&self.name(), bound.file));
+        // Read last: the socket of an endpoint that closes looks like that of a dead process, and another process may
+        // remove it. Closing sets the flag before.
+        is_there || self.closed.load(Ordering::SeqCst)
     }
 
     /// The path of the socket; see [`is_there`](Self::is_there). `None` while the endpoint does not
