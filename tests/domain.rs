@@ -549,7 +549,11 @@ async fn routes_apply_within_a_host_and_no_other_transport_is_used() {
     let config = config(&["routes={ \"arm\" = [\"tcp\"], \"leg\" = [\"unix\"] }"]);
     let (here, there) = two(&config).await;
     let rover = here.register("rover").await.unwrap();
-    for (name, via) in [("arm", None), ("leg", Some(Kind::Unix)), ("eye", Some(Kind::Shm))] {
+    for (name, via) in [
+        ("arm", None),
+        ("leg", Some(Kind::Unix)),
+        ("eye", Some(Kind::Shm)),
+    ] {
         let agent = there.register(name).await.unwrap();
         let sent = rover.send(inform(&rover, name, "x")).await.unwrap();
         // A process uses no TCP here, so the letter to the arm fails.
