@@ -50,6 +50,14 @@ impl fmt::Display for Machine {
 }
 
 impl Machine {
+    /// The first line of a result: the machine, and its load before the measurement.
+    pub(crate) fn heading(&self) -> String {
+        format!(
+            "{self}; {:.0} % of the CPU time used by other processes before the start\n",
+            self.busy * 100.0,
+        )
+    }
+
     /// Observes this machine for half a second, in which the caller should start nothing.
     pub async fn observe() -> Self {
         let before = Jiffies::read();

@@ -27,10 +27,7 @@ pub(super) fn json(machine: &Machine, effort: &Effort, measured: &Measured) -> V
 
 /// All results as a table with a legend.
 pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> String {
-    let mut text = format!(
-        "{machine}; {:.0} % of the CPU time used by other processes before the start\n",
-        machine.busy * 100.0,
-    );
+    let mut text = machine.heading();
     text.push_str(&format!(
         "{} rounds; each round measures every route in turn; sender and receiver on separate CPUs if \
          there are two; times in microseconds\n\n",
@@ -76,9 +73,7 @@ fn summary(rows: &[Row]) -> String {
     let shown = rows.iter().filter(|row| {
         row.size == typical && row.fill == Fill::Copied && row.round_trip_ratio.is_some()
     });
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING);
-    table.set_header([
+    let head = [
         "route",
         "wait",
         "round trip",
@@ -86,10 +81,8 @@ fn summary(rows: &[Row]) -> String {
         "ratio",
         "rate/s",
         "ratio",
-    ]);
-    for column in table.column_iter_mut().skip(2) {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
+    ];
+    let mut table = empty_table(head, 2);
     let ratio = |ratio: Option<f64>| ratio.map_or_else(String::new, |ratio| format!("{ratio:.2}"));
     for row in shown {
         let limit = row.limit.as_ref();
@@ -155,9 +148,18 @@ fn of_many(many: &Many) -> String {
     )
 }
 
-fn table(rows: &[Row]) -> Table {
+/// Creates a table with this header. All columns but the first `left` ones are aligned to the right.
+pub(super) fn empty_table<const N: usize>(header: [&str; N], left: usize) -> Table {
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
+    table.set_header(header);
+    for column in table.column_iter_mut().skip(left) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    table
+}
+
+fn table(rows: &[Row]) -> Table {
     let head = [
         "content",
         "route",
@@ -175,10 +177,7 @@ fn table(rows: &[Row]) -> Table {
         "rate",
         "cpu",
     ];
-    table.set_header(head);
-    for column in table.column_iter_mut().skip(3) {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
+    let mut table = empty_table(head, 3);
     let mut last = String::new();
     for row in rows {
         let content = format!("{} {}", size(row.size), name_of(row.fill));

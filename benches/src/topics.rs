@@ -13,6 +13,7 @@ use crate::error::BenchError;
 use crate::machine::Machine;
 use crate::measure::{WARMING, median, quantile, times};
 use crate::part::{End, Event, Fill, Letters, Order, Part};
+use crate::report::empty_table;
 use crate::stage::{ProcessIndex, Stage};
 
 /// Numbers of subscribers.
@@ -325,13 +326,12 @@ impl TopicsReport {
     /// The result as a table with a legend.
     #[must_use]
     pub fn to_text(&self) -> String {
-        let mut text = format!(
-            "{}; {:.0} % of the CPU time used by other processes before the start\n{} rounds; each round \
-             measures every mechanism in turn; publications of 1 MiB; times in microseconds\n\n",
-            self.machine,
-            self.machine.busy * 100.0,
+        let mut text = self.machine.heading();
+        text.push_str(&format!(
+            "{} rounds; each round measures every mechanism in turn; publications of 1 MiB; times in \
+             microseconds\n\n",
             self.rounds,
-        );
+        ));
         text.push_str(&self.table());
         text.push_str(LEGEND);
         for note in &self.notes {
@@ -341,10 +341,7 @@ impl TopicsReport {
     }
 
     fn table(&self) -> String {
-        use comfy_table::{CellAlignment, Table, presets};
-        let mut table = Table::new();
-        table.load_style(presets::NOTHING);
-        table.set_header([
+        let header = [
             "subscribers",
             "fipa",
             "iceoryx2",
@@ -357,10 +354,8 @@ impl TopicsReport {
             "iceoryx2",
             "zenoh",
             "target",
-        ]);
-        for column in table.column_iter_mut() {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
+        ];
+        let mut table = empty_table(header, 0);
         let time = |time: f64| format!("{time:.0}");
         let ratio = |ratio: f64| format!("{ratio:.2}");
         let spread = |[low, high]: [f64; 2]| format!("{low:.2}-{high:.2}");

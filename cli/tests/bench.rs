@@ -47,13 +47,10 @@ fn number(value: &Value) -> f64 {
         .unwrap_or_else(|| panic!("{value} is not a number"))
 }
 
-/// Runs a quick measurement. Returns its process, its report and its drawing.
-fn measured_and_drawn(arguments: &[&str]) -> (u32, Value, String) {
-    let directory = tempfile::tempdir().unwrap();
-    let picture = directory.path().join("measured.svg");
+/// Runs a quick measurement. Returns its process and its report.
+fn measured(arguments: &[&str]) -> (u32, Value) {
     let child = bench(arguments)
-        .args(["--quick", "--json", "--svg"])
-        .arg(&picture)
+        .args(["--quick", "--json"])
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
@@ -62,7 +59,15 @@ fn measured_and_drawn(arguments: &[&str]) -> (u32, Value, String) {
     let output = child.wait_with_output().unwrap();
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{errors}");
-    let report = serde_json::from_slice(&output.stdout).unwrap();
+    (pid, serde_json::from_slice(&output.stdout).unwrap())
+}
+
+/// Runs a quick measurement. Returns its process, its report and its drawing.
+fn measured_and_drawn(arguments: &[&str]) -> (u32, Value, String) {
+    let directory = tempfile::tempdir().unwrap();
+    let picture = directory.path().join("measured.svg");
+    let svg = ["--svg", picture.to_str().unwrap()];
+    let (pid, report) = measured(&[arguments, &svg].concat());
     (pid, report, std::fs::read_to_string(&picture).unwrap())
 }
 
@@ -197,16 +202,7 @@ fn locks_need_the_letters_of_their_algorithm() {
 
 #[test]
 fn publications_for_1_4_and_16_subscribers_are_measured() {
-    let child = bench(&["topics", "--quick", "--json"])
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let pid = child.id();
-    let output = child.wait_with_output().unwrap();
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{errors}");
-    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let (pid, report) = measured(&["topics"]);
     assert_eq!(report["notes"], serde_json::json!([]), "{report:#}");
     let rows = report["rows"].as_array().unwrap();
     let subscribers: Vec<f64> = rows.iter().map(|row| number(&row["subscribers"])).collect();

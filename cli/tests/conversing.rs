@@ -324,7 +324,7 @@ fn topics_lists_topics_with_their_rates_and_subscribers() {
     viewer.send_signal("-CONT");
     let watched = host.run(&["topics", "--watch", "--for", "2s"]).done();
     assert!(watched.matches("AGENT").count() > 1, "{watched}");
-    let unknown = host.run(&["topics", "nobody"]).failed(1);
+    let unknown = host.run(&["topics", "unknown"]).failed(1);
     assert!(unknown.contains("no such agent"), "{unknown}");
     drop(gateway);
 }

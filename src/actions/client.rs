@@ -196,9 +196,8 @@ impl<'a> Robot<'a> {
         })
     }
 
-    /// Returns the time for an answer: the deadlines of the message and of the answer.
     fn timeout(&self) -> Duration {
-        self.agent.domain().inner.deadline() * 2
+        self.agent.domain().inner.answer_timeout()
     }
 
     fn message(&self, act: Performative, ask: &Ask) -> Result<MessageBuilder, ActionError> {

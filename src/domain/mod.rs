@@ -75,6 +75,12 @@ impl Inner {
     pub(crate) fn deadline(&self) -> Duration {
         Duration::from_nanos(self.deadline.load(Ordering::Relaxed))
     }
+
+    /// Returns the time for a question and its answer: their two deadlines.
+    #[cfg(feature = "protocols")]
+    pub(crate) fn answer_timeout(&self) -> Duration {
+        self.deadline() * 2
+    }
 }
 
 impl Drop for Inner {

@@ -432,9 +432,8 @@ impl Server {
         self.core.endpoint.domain.directory()
     }
 
-    /// Returns the time for an answer: the deadlines of the request and of the answer.
     fn timeout(&self) -> Duration {
-        self.core.endpoint.domain.inner.deadline() * 2
+        self.core.endpoint.domain.inner.answer_timeout()
     }
 
     fn message(

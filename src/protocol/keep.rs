@@ -1,4 +1,4 @@
-//! What a subscriber to a topic asks for, and the parameters of the messages that carry it.
+//! The notifications that a subscriber to a topic asks for, and the parameters of the messages that carry the wish.
 
 use std::fmt;
 use std::num::NonZeroU32;

@@ -64,8 +64,7 @@ impl Agent {
             .ontology(ONTOLOGY)
             .language("fipa-sl")
             .content(content);
-        // The deadlines of the question and of the answer.
-        let timeout = self.domain().inner.deadline() * 2;
+        let timeout = self.domain().inner.answer_timeout();
         let answer = self.query(message, timeout).await?.result().await?;
         read_answer(answer.content().map_or(&[][..], |content| content))
     }

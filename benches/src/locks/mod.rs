@@ -21,6 +21,7 @@ use crate::error::BenchError;
 use crate::machine::Machine;
 use crate::part::Variant;
 use crate::plot;
+use crate::report::empty_table;
 
 /// Largest ratio of a lock to the letters sent by hand that the project aims for.
 const TARGET: f64 = 1.2;
@@ -271,13 +272,11 @@ impl LocksReport {
     /// The result as tables with a legend.
     #[must_use]
     pub fn to_text(&self) -> String {
-        let mut text = format!(
-            "{}; {:.0} % of the CPU time used by other processes before the start\n{} rounds; times in \
-             microseconds\n\nAcquire and release, without contention:\n",
-            self.machine,
-            self.machine.busy * 100.0,
+        let mut text = self.machine.heading();
+        text.push_str(&format!(
+            "{} rounds; times in microseconds\n\nAcquire and release, without contention:\n",
             self.rounds,
-        );
+        ));
         text.push_str(&self.table());
         text.push_str(LEGEND);
         for hand_over in &self.hand_overs {
@@ -293,16 +292,11 @@ impl LocksReport {
     }
 
     fn table(&self) -> String {
-        use comfy_table::{CellAlignment, Table, presets};
-        let mut table = Table::new();
-        table.load_style(presets::NOTHING);
-        table.set_header([
+        let header = [
             "group", "needed", "letters", "by hand", "locks", "x hand", "(spread)", "cpu",
             "x hand", "target",
-        ]);
-        for column in table.column_iter_mut().skip(1) {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
+        ];
+        let mut table = empty_table(header, 1);
         for row in &self.rows {
             let [low, high] = row.ratio_spread;
             table.add_row([

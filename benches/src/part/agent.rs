@@ -73,6 +73,101 @@ impl Agent {
         Ok(())
     }
 
+    fn begin(
+        &mut self,
+        letters: &Letters,
+        number: usize,
+        sent: &mut Sent,
+    ) -> Result<Sending, String> {
+        let message = self
+            .message
+            .clone()
+            .ok_or("the other end was not found yet")?;
+        let byte = byte_of(number);
+        if letters.fill == Fill::Copied {
+            let content = self.content(letters.size, byte);
+            let message = message.content(content).build().map_err(chain_text)?;
+            sent.began.push(now_ns());
+            return Ok(Box::pin(self.agent.send(message)));
+        }
+        let message = message.build().map_err(chain_text)?;
+        sent.began.push(now_ns());
+        let mut loan = self.agent.loan(message, letters.size).map_err(chain_text)?;
+        if letters.fill == Fill::Filled {
+            loan.content_mut().fill(byte);
+        }
+        Ok(Box::pin(self.agent.send_loan(loan)))
+    }
+
+    /// Content with this first and last byte. The previous content is reused if no letter refers to
+    /// it.
+    fn content(&mut self, size: usize, byte: u8) -> Bytes {
+        let before = std::mem::take(&mut self.ready);
+        let mut content = match before.try_into_mut() {
+            Ok(content) if content.len() == size => content,
+            _ => BytesMut::zeroed(size),
+        };
+        for at in [0, size.saturating_sub(1)] {
+            if let Some(place) = content.get_mut(at) {
+                *place = byte;
+            }
+        }
+        let content = content.freeze();
+        self.ready = content.clone();
+        content
+    }
+}
+
+impl<A: Send + 'static> Running<A> {
+    /// Runs work with the agents in a task.
+    pub(super) fn run<T: Send + 'static, F>(
+        &mut self,
+        work: impl FnOnce(A) -> F + Send + 'static,
+    ) -> Result<T, String>
+    where
+        F: Future<Output = (A, T)> + Send + 'static,
+    {
+        let agent = self.agent.take().ok_or("the agent is not available")?;
+        let task = self.runtime.spawn(async move { work(agent).await });
+        let (agent, done) = self.runtime.block_on(task).map_err(chain_text)?;
+        self.agent = Some(agent);
+        Ok(done)
+    }
+}
+
+/// The steps of agents that execute orders in a task.
+pub(super) trait Steps: Sized + Send + 'static {
+    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>>;
+
+    fn find(&mut self, _to: &str) -> impl Future<Output = Result<(), String>> + Send {
+        async { Err("this part does not connect".to_owned()) }
+    }
+
+    fn receive(
+        &mut self,
+        _letters: &Letters,
+    ) -> impl Future<Output = Result<Vec<u64>, String>> + Send {
+        async { Err("this part does not receive".to_owned()) }
+    }
+
+    fn send(&mut self, _letters: &Letters) -> impl Future<Output = Result<Sent, String>> + Send {
+        async { Err("this process does not send".to_owned()) }
+    }
+
+    fn spread(
+        &mut self,
+        _what: Spread,
+        _letters: &Letters,
+    ) -> impl Future<Output = Result<Sent, String>> + Send {
+        async { Err("this part sends to one receiver only".to_owned()) }
+    }
+}
+
+impl Steps for Agent {
+    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>> {
+        &mut self.orders
+    }
+
     async fn find(&mut self, to: &str) -> Result<(), String> {
         let all = Query::by_name(Matcher::parse(to).map_err(chain_text)?);
         let directory = self.agent.domain().directory();
@@ -166,95 +261,17 @@ impl Agent {
         }
         Ok(sent)
     }
-
-    fn begin(
-        &mut self,
-        letters: &Letters,
-        number: usize,
-        sent: &mut Sent,
-    ) -> Result<Sending, String> {
-        let message = self
-            .message
-            .clone()
-            .ok_or("the other end was not found yet")?;
-        let byte = byte_of(number);
-        if letters.fill == Fill::Copied {
-            let content = self.content(letters.size, byte);
-            let message = message.content(content).build().map_err(chain_text)?;
-            sent.began.push(now_ns());
-            return Ok(Box::pin(self.agent.send(message)));
-        }
-        let message = message.build().map_err(chain_text)?;
-        sent.began.push(now_ns());
-        let mut loan = self.agent.loan(message, letters.size).map_err(chain_text)?;
-        if letters.fill == Fill::Filled {
-            loan.content_mut().fill(byte);
-        }
-        Ok(Box::pin(self.agent.send_loan(loan)))
-    }
-
-    /// Content with this first and last byte. The previous content is reused if no letter refers to
-    /// it.
-    fn content(&mut self, size: usize, byte: u8) -> Bytes {
-        let before = std::mem::take(&mut self.ready);
-        let mut content = match before.try_into_mut() {
-            Ok(content) if content.len() == size => content,
-            _ => BytesMut::zeroed(size),
-        };
-        for at in [0, size.saturating_sub(1)] {
-            if let Some(place) = content.get_mut(at) {
-                *place = byte;
-            }
-        }
-        let content = content.freeze();
-        self.ready = content.clone();
-        content
-    }
 }
 
-impl<A: Send + 'static> Running<A> {
-    /// Runs work with the agents in a task.
-    pub(super) fn run<T: Send + 'static, F>(
-        &mut self,
-        work: impl FnOnce(A) -> F + Send + 'static,
-    ) -> Result<T, String>
-    where
-        F: Future<Output = (A, T)> + Send + 'static,
-    {
-        let agent = self.agent.take().ok_or("the agent is not available")?;
-        let task = self.runtime.spawn(async move { work(agent).await });
-        let (agent, done) = self.runtime.block_on(task).map_err(chain_text)?;
-        self.agent = Some(agent);
-        Ok(done)
-    }
-}
-
-/// Agents that read orders from standard input.
-pub(super) trait Ordered: Send + 'static {
-    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>>;
-}
-
-impl<A: Ordered> Running<A> {
-    /// Reads the next order. The runtime runs meanwhile, so the agents answer at any time.
-    pub(super) fn read_order(&mut self) -> Option<String> {
+impl<A: Steps> Peer for Running<A> {
+    /// The runtime runs meanwhile, so the agents answer at any time.
+    fn next_order(&mut self) -> Option<String> {
         self.run(|mut agent| async move {
             let line = agent.orders().next_line().await;
             (agent, line)
         })
         .ok()?
         .ok()?
-    }
-}
-
-impl Ordered for Agent {
-    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>> {
-        &mut self.orders
-    }
-}
-
-impl Peer for Running<Agent> {
-    fn next_order(&mut self) -> Option<String> {
-        self.read_order()
     }
 
     fn find(&mut self, to: &str) -> Result<(), String> {

@@ -7,8 +7,8 @@ use fipa::topics::{Publisher, Topic};
 use fipa::{AgentId, Config, Domain, Performative, protocol::Subscription};
 use tokio::io::{BufReader, Lines, Stdin};
 
-use super::agent::{Ordered, Running, orders, runtime};
-use super::orders::{Letters, Peer, Sent, byte_of, check, execute_orders, now_ns};
+use super::agent::{Running, Steps, orders, runtime};
+use super::orders::{Letters, Sent, byte_of, check, execute_orders, now_ns};
 use crate::error::chain_text;
 
 /// Name of the agent that publishes.
@@ -41,14 +41,11 @@ pub(super) fn subscribe(config: &Config, index: usize) -> Result<(), String> {
 }
 
 /// Executes orders with one agent.
-fn play<A>(
+fn play<A: Steps>(
     config: &Config,
     name: &str,
     make: impl FnOnce(fipa::Agent, Lines<BufReader<Stdin>>) -> Result<A, String>,
-) -> Result<(), String>
-where
-    Running<A>: Peer,
-{
+) -> Result<(), String> {
     let runtime = runtime()?;
     let domain = runtime.block_on(Domain::open(config)).map_err(chain_text)?;
     let agent = runtime.block_on(async {
@@ -74,8 +71,12 @@ struct Publishing {
     orders: Lines<BufReader<Stdin>>,
 }
 
-impl Publishing {
-    async fn send(&self, letters: &Letters) -> Result<Sent, String> {
+impl Steps for Publishing {
+    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>> {
+        &mut self.orders
+    }
+
+    async fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
         let mut sent = Sent::with_room(letters);
         for number in 0..letters.count {
             tokio::time::sleep(letters.pause()).await;
@@ -93,33 +94,17 @@ impl Publishing {
     }
 }
 
-impl Ordered for Publishing {
-    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>> {
-        &mut self.orders
-    }
-}
-
-impl Peer for Running<Publishing> {
-    fn next_order(&mut self) -> Option<String> {
-        self.read_order()
-    }
-
-    fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
-        let letters = *letters;
-        self.run(move |agent| async move {
-            let sent = agent.send(&letters).await;
-            (agent, sent)
-        })?
-    }
-}
-
 struct Subscribing {
     subscription: Option<Subscription>,
     agent: fipa::Agent,
     orders: Lines<BufReader<Stdin>>,
 }
 
-impl Subscribing {
+impl Steps for Subscribing {
+    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>> {
+        &mut self.orders
+    }
+
     /// Subscribes to the topic of this agent, as soon as the directory has it.
     async fn find(&mut self, to: &str) -> Result<(), String> {
         let directory = self.agent.domain().directory();
@@ -147,33 +132,5 @@ impl Subscribing {
             check(notification.content().ok_or("no content")?, letters, number)?;
         }
         Ok(at)
-    }
-}
-
-impl Ordered for Subscribing {
-    fn orders(&mut self) -> &mut Lines<BufReader<Stdin>> {
-        &mut self.orders
-    }
-}
-
-impl Peer for Running<Subscribing> {
-    fn next_order(&mut self) -> Option<String> {
-        self.read_order()
-    }
-
-    fn find(&mut self, to: &str) -> Result<(), String> {
-        let to = to.to_owned();
-        self.run(|mut agent| async move {
-            let found = agent.find(&to).await;
-            (agent, found)
-        })?
-    }
-
-    fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
-        let letters = *letters;
-        self.run(move |mut agent| async move {
-            let received = agent.receive(&letters).await;
-            (agent, received)
-        })?
     }
 }

@@ -8,11 +8,11 @@ use fipa::actions::{
     ActionDescription, ActionError, GoalStatus, ParameterDescription, Policy, Type,
 };
 use fipa::protocol::DialogueError;
-use fipa::{Agent, AgentId, Config, Reach, Role};
+use fipa::{Agent, AgentId, Config};
 use fipa_acl::escape;
 use serde_json::{Value, json};
-use tokio::task::JoinSet;
 
+use super::ask::{agents_of_this_host, ask_all};
 use super::df::asking;
 use super::request::in_full;
 use crate::complete;
@@ -120,35 +120,13 @@ async fn list(agent: &Agent, robot: &AgentId, goals: bool) -> Result<Listed, Act
 
 /// Asks all agents of this host at the same time. Those that do not answer in time offer no actions.
 async fn all(agent: &Arc<Agent>, goals: bool) -> Vec<(String, Listed)> {
-    let directory = agent.domain().directory();
-    directory.refresh();
-    let entries = directory.entries();
-    let names = entries.iter().filter(|entry| {
-        entry.role == Role::Agent
-            && entry.reach == Reach::Local
-            && !entry.is_platform_agent()
-            && *entry.name != *agent.name()
-    });
-    let mut asked = JoinSet::new();
-    for name in names.map(|entry| entry.name.to_string()) {
-        let Ok(robot) = AgentId::new(&*name) else {
-            continue;
-        };
+    let answers = ask_all(agents_of_this_host(agent), |robot| {
         let agent = Arc::clone(agent);
-        asked.spawn(async move { (name, list(&agent, &robot, goals).await) });
-    }
-    let mut found = Vec::new();
-    while let Some(answered) = asked.join_next().await {
-        match answered {
-            Ok((name, Ok(listed))) => found.push((name, listed)),
-            Ok((name, Err(error))) => {
-                tracing::debug!(agent = %escape(&name), %error, "the agent lists no actions");
-            }
-            Err(error) => tracing::debug!(%error, "a question has ended"),
-        }
-    }
-    found.sort_by(|(one, _), (other, _)| one.cmp(other));
-    found
+        async move { list(&agent, &robot, goals).await }
+    });
+    let answers = answers.await.into_iter();
+    let offered = answers.filter_map(|(name, listed)| Some((name, listed?)));
+    offered.collect()
 }
 
 /// The error report of a call about actions.

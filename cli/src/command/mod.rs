@@ -3,6 +3,7 @@
 mod actions;
 mod agents;
 mod ams;
+mod ask;
 #[cfg(feature = "bench")]
 mod bench;
 mod coalition;

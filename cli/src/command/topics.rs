@@ -9,11 +9,11 @@ use clap::Args;
 use fipa::platform::{AgentDescription, PlatformError, ServiceDescription};
 use fipa::protocol::DialogueError;
 use fipa::topics::{SubscriberStatus, TopicStatus, TopicsError};
-use fipa::{Agent, AgentId, Config, Domain, Reach, Role};
+use fipa::{Agent, AgentId, Config, Domain};
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
-use tokio::task::JoinSet;
 
+use super::ask::{agents_of_this_host, ask_all};
 use super::df::asking;
 use super::request::in_full;
 use crate::complete;
@@ -133,19 +133,10 @@ async fn list(
             let found = df.search(&topics).await;
             let found = found.map_err(|error| super::df::failed(&error, config))?;
             let names = found.into_iter().filter_map(|it| it.name);
-            Ok(ask_all(agent, names).await)
+            Ok(topics_of_all(agent, names).await)
         }
         Err(PlatformError::NoAgent(_)) => {
-            let directory = agent.domain().directory();
-            directory.refresh();
-            let entries = directory.entries();
-            let here = entries.iter().filter(|entry| {
-                entry.role == Role::Agent
-                    && entry.reach == Reach::Local
-                    && *entry.name != *agent.name()
-            });
-            let names = here.filter_map(|entry| AgentId::new(&*entry.name).ok());
-            let mut listed = ask_all(agent, names).await;
+            let mut listed = topics_of_all(agent, agents_of_this_host(agent)).await;
             // An agent without topics does not answer.
             listed.retain(|_, topics| topics.is_some());
             Ok(listed)
@@ -155,29 +146,15 @@ async fn list(
 }
 
 /// Asks agents for their topics at the same time.
-async fn ask_all(agent: &Arc<Agent>, publishers: impl Iterator<Item = AgentId>) -> Listed {
-    let mut asked = JoinSet::new();
-    for publisher in publishers {
+async fn topics_of_all(
+    agent: &Arc<Agent>,
+    publishers: impl IntoIterator<Item = AgentId>,
+) -> Listed {
+    let answers = ask_all(publishers, |publisher| {
         let agent = Arc::clone(agent);
-        asked.spawn(async move {
-            let topics = agent.topics_of(&publisher).await;
-            (publisher.name().to_owned(), topics)
-        });
-    }
-    let mut listed = Listed::new();
-    while let Some(answered) = asked.join_next().await {
-        match answered {
-            Ok((name, Ok(topics))) => {
-                listed.insert(name, Some(topics));
-            }
-            Ok((name, Err(error))) => {
-                tracing::debug!(agent = %escape_name(&name), %error, "the agent tells no topics");
-                listed.insert(name, None);
-            }
-            Err(error) => tracing::debug!(%error, "a question has ended"),
-        }
-    }
-    listed
+        async move { agent.topics_of(&publisher).await }
+    });
+    answers.await
 }
 
 fn print(agent: &Agent, listed: &Listed, arguments: &Arguments) -> Result<(), Failure> {
