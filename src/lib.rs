@@ -59,7 +59,8 @@
 //! [`Agent::subscribe`] notify many agents. `monitor.check = "enforce"` checks all messages of a process
 //! against the protocols.
 //!
-//! [`Agent::own`] and [`Agent::lock`] reserve resources that agents share ([`locks`]).
+//! [`Agent::own`] and [`Agent::lock`] reserve resources that agents share ([`locks`]). [`Agent::found_coalition`] gives
+//! several agents one name and a leader that another member replaces ([`coalitions`]).
 //!
 //! [`Agent::offer`] (feature `actions`) offers an action of a robot, and [`Agent::robot`] lists and invokes
 //! those of another ([`actions`]).
@@ -104,6 +105,8 @@ pub mod admin;
 mod agent;
 mod any_error;
 pub mod blocking;
+#[cfg(feature = "protocols")]
+pub mod coalitions;
 pub mod config;
 mod domain;
 pub mod error;

@@ -3,7 +3,8 @@
 //!
 //! A coalition is an entry with the role [`Role::Coalition`], which lists its [`Members`] by name:
 //! an agent that moves to another host stays a member. A coalition has no queue; a letter to it is
-//! sent as one letter to each member, or to its leader. Members may be coalitions.
+//! sent as one letter to each member, or to its leader. Members may be coalitions. A coalition that is led
+//! and has no leader at present is vacant: letters to it wait for the next leader.
 //!
 //! Entries from the network may be hostile, so the number of members, the nesting depth of
 //! coalitions and the number of agents that one name stands for are bounded.
@@ -15,15 +16,27 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Entry, NameError, Role, View, check_name};
 
-/// Members of a coalition, and its leader if it has one.
+/// Members of a coalition, and its leader if it is led.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(try_from = "CoalitionRecord", into = "CoalitionRecord")]
 pub struct Members {
     names: Arc<[Arc<str>]>,
-    leader: Option<Arc<str>>,
+    leadership: Leadership,
 }
 
-/// Serialized form: `{"members": [name], "leader": name}`.
+/// The receivers of letters to a coalition.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+enum Leadership {
+    /// All members.
+    Shared,
+    /// The next leader, for which letters wait.
+    Vacant,
+    /// This member.
+    Led(Arc<str>),
+}
+
+/// Serialized form: `{"members": [name], "leader": name}`, without `leader` if the coalition is not led, and with an
+/// empty one if it is vacant.
 #[derive(Serialize, Deserialize)]
 struct CoalitionRecord {
     members: Vec<Arc<str>>,
@@ -47,6 +60,23 @@ impl Members {
         names: impl IntoIterator<Item = N>,
         leader: Option<Arc<str>>,
     ) -> Result<Self, MembersError> {
+        Self::with(names, leader.map_or(Leadership::Shared, Leadership::Led))
+    }
+
+    /// Creates a member list of a coalition that is led and has no leader at present: letters to it wait.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn vacant<N: Into<Arc<str>>>(
+        names: impl IntoIterator<Item = N>,
+    ) -> Result<Self, MembersError> {
+        Self::with(names, Leadership::Vacant)
+    }
+
+    fn with<N: Into<Arc<str>>>(
+        names: impl IntoIterator<Item = N>,
+        leadership: Leadership,
+    ) -> Result<Self, MembersError> {
         let (mut members, mut bytes) = (Vec::<Arc<str>>::new(), 0);
         for name in names.into_iter().map(Into::into) {
             check_name(&name)?;
@@ -62,14 +92,14 @@ impl Members {
         if members.is_empty() {
             return Err(MembersError::None);
         }
-        if let Some(leader) = &leader
+        if let Leadership::Led(leader) = &leadership
             && !members.contains(leader)
         {
             return Err(MembersError::Leader(leader.to_string()));
         }
         Ok(Self {
             names: members.into(),
-            leader,
+            leadership,
         })
     }
 
@@ -82,14 +112,24 @@ impl Members {
     /// The leader, which receives all letters to the coalition, if there is one.
     #[must_use]
     pub fn leader(&self) -> Option<&Arc<str>> {
-        self.leader.as_ref()
+        match &self.leadership {
+            Leadership::Led(leader) => Some(leader),
+            Leadership::Shared | Leadership::Vacant => None,
+        }
+    }
+
+    /// Whether the coalition is led and has no leader at present.
+    #[must_use]
+    pub fn is_vacant(&self) -> bool {
+        self.leadership == Leadership::Vacant
     }
 
     /// Receivers of letters to the coalition.
     fn addressed(&self) -> &[Arc<str>] {
-        match &self.leader {
-            Some(leader) => std::slice::from_ref(leader),
-            None => &self.names,
+        match &self.leadership {
+            Leadership::Led(leader) => std::slice::from_ref(leader),
+            Leadership::Shared => &self.names,
+            Leadership::Vacant => &[],
         }
     }
 }
@@ -98,7 +138,12 @@ impl TryFrom<CoalitionRecord> for Members {
     type Error = MembersError;
 
     fn try_from(record: CoalitionRecord) -> Result<Self, MembersError> {
-        Self::new(record.members, record.leader)
+        let leadership = match record.leader {
+            None => Leadership::Shared,
+            Some(leader) if leader.is_empty() => Leadership::Vacant,
+            Some(leader) => Leadership::Led(leader),
+        };
+        Self::with(record.members, leadership)
     }
 }
 
@@ -106,7 +151,11 @@ impl From<Members> for CoalitionRecord {
     fn from(members: Members) -> Self {
         Self {
             members: members.names.to_vec(),
-            leader: members.leader,
+            leader: match members.leadership {
+                Leadership::Shared => None,
+                Leadership::Vacant => Some("".into()),
+                Leadership::Led(leader) => Some(leader),
+            },
         }
     }
 }
@@ -139,41 +188,64 @@ const MAX_DEPTH: usize = 4;
 /// Maximum number of agents that one coalition stands for, including nested coalitions.
 const MAX_AGENTS: usize = 256;
 
-/// Returns the agents to which a letter from `sender` to this coalition goes, and the names of
-/// members that have no entry or exceed the bounds.
+/// Returns the agents to which a letter from `sender` to this coalition goes.
 pub(crate) fn agents_of<V: View + ?Sized>(
     view: &V,
     coalition: &Entry,
     sender: &str,
-) -> (Vec<Arc<Entry>>, Vec<Arc<str>>) {
+) -> ResolvedMembers {
     let mut resolved = ResolvedMembers {
         seen: HashSet::from([Arc::clone(&coalition.name)]),
         ..ResolvedMembers::default()
     };
     resolved.add(view, coalition, sender, 1);
-    (resolved.agents, resolved.missing)
+    resolved
 }
 
+/// Whether a coalition with these members is led and its leader has no entry.
+pub(crate) fn is_leaderless<V: View + ?Sized>(view: &V, members: &Members) -> bool {
+    let absent = |leader: &Arc<str>| view.named(leader).is_none();
+    members.is_vacant() || members.leader().is_some_and(absent)
+}
+
+/// The agents that a coalition stands for.
 #[derive(Default)]
-struct ResolvedMembers {
+pub(crate) struct ResolvedMembers {
     seen: HashSet<Arc<str>>,
-    agents: Vec<Arc<Entry>>,
-    missing: Vec<Arc<str>>,
+    /// The agents that have an entry.
+    pub(crate) agents: Vec<Arc<Entry>>,
+    /// The members that have no entry or exceed the bounds.
+    pub(crate) missing: Vec<Arc<str>>,
+    /// The coalitions that are led and whose leader has no entry.
+    pub(crate) leaderless: Vec<Arc<str>>,
 }
 
 impl ResolvedMembers {
+    /// Whether the letter goes to no agent and has no outcome.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    fn len(&self) -> usize {
+        self.agents.len() + self.missing.len() + self.leaderless.len()
+    }
+
     fn add<V: View + ?Sized>(&mut self, view: &V, coalition: &Entry, sender: &str, depth: usize) {
         let Role::Coalition(members) = &coalition.role else {
             return;
         };
         let led = members.leader().is_some();
+        if is_leaderless(view, members) {
+            self.leaderless.push(Arc::clone(&coalition.name));
+            return;
+        }
         for name in members.addressed() {
             // A member's letter to its coalition does not go back to that member; a leader receives
             // every letter, including its own. An agent that is a member twice gets one letter.
             if (!led && **name == *sender) || !self.seen.insert(Arc::clone(name)) {
                 continue;
             }
-            let full = self.agents.len() + self.missing.len() >= MAX_AGENTS;
+            let full = self.len() >= MAX_AGENTS;
             match view.named(name).filter(|_| !full) {
                 Some(entry) => match &entry.role {
                     Role::Agent => self.agents.push(entry),
@@ -213,9 +285,17 @@ mod tests {
 
     fn meant(directory: &MemoryDirectory, name: &str, sender: &str) -> (Vec<String>, Vec<String>) {
         match resolve(directory, name, sender).unwrap() {
-            Resolution::Coalition { agents, missing } => (
+            Resolution::Coalition {
+                agents,
+                missing,
+                leaderless,
+            } => (
                 agents.iter().map(|entry| entry.name.to_string()).collect(),
-                missing.iter().map(ToString::to_string).collect(),
+                missing
+                    .iter()
+                    .chain(&leaderless)
+                    .map(ToString::to_string)
+                    .collect(),
             ),
             Resolution::None => (Vec::new(), Vec::new()),
             other => panic!("{other:?}"),
@@ -241,6 +321,11 @@ mod tests {
         let json = serde_json::to_string(&twice).unwrap();
         assert_eq!(json, r#"{"members":["a","b"]}"#);
         assert_eq!(serde_json::from_str::<Members>(&json).unwrap(), twice);
+        let vacant = Members::vacant(["a"]).unwrap();
+        assert_eq!(vacant.leader(), None);
+        let json = serde_json::to_string(&vacant).unwrap();
+        assert_eq!(json, r#"{"members":["a"],"leader":""}"#);
+        assert_eq!(serde_json::from_str::<Members>(&json).unwrap(), vacant);
         let stranger = r#"{"members":["a"],"leader":"b"}"#;
         assert!(serde_json::from_str::<Members>(stranger).is_err());
     }

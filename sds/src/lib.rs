@@ -63,6 +63,6 @@ pub use merged::MergedDirectory;
 pub use name::{MAX_NAME, NameError, check_characters, check_name, to_name};
 pub use query::{Matcher, Query};
 pub use reserved::{reserved_for, second_name};
-pub use resolve::{Resolution, is_legacy_pattern, resolve, resolve_legacy};
+pub use resolve::{Resolution, is_leaderless, is_legacy_pattern, resolve, resolve_legacy};
 pub use view::{Snapshot, View};
 pub use watch::{Change, Subscriber, Watch};

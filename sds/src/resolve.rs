@@ -17,6 +17,8 @@ pub enum Resolution {
         agents: Vec<Arc<Entry>>,
         /// Members without an entry, or beyond the bounds of one coalition.
         missing: Vec<Arc<str>>,
+        /// The coalitions, this one or nested ones, that are led and whose leader has no entry at present.
+        leaderless: Vec<Arc<str>>,
     },
     /// No entry: the name is unknown, or the pattern or coalition has no agent except the sender.
     None,
@@ -29,7 +31,11 @@ impl Resolution {
     pub fn is_complete(&self) -> bool {
         match self {
             Self::Exact(_) => true,
-            Self::Coalition { missing, .. } => missing.is_empty(),
+            Self::Coalition {
+                missing,
+                leaderless,
+                ..
+            } => missing.is_empty() && leaderless.is_empty(),
             Self::Multicast(_) | Self::None => false,
         }
     }
@@ -52,10 +58,17 @@ pub fn resolve<V: View + ?Sized>(
 ) -> Result<Resolution, PatternError> {
     if let Some(entry) = view.named(receiver) {
         return Ok(match &entry.role {
-            Role::Coalition(_) => match coalition::agents_of(view, &entry, sender) {
-                (agents, missing) if agents.is_empty() && missing.is_empty() => Resolution::None,
-                (agents, missing) => Resolution::Coalition { agents, missing },
-            },
+            Role::Coalition(_) => {
+                let resolved = coalition::agents_of(view, &entry, sender);
+                match resolved.is_empty() {
+                    true => Resolution::None,
+                    false => Resolution::Coalition {
+                        agents: resolved.agents,
+                        missing: resolved.missing,
+                        leaderless: resolved.leaderless,
+                    },
+                }
+            }
             _ => Resolution::Exact(entry),
         });
     }
@@ -75,6 +88,16 @@ pub fn resolve<V: View + ?Sized>(
         Resolution::None
     } else {
         Resolution::Multicast(found)
+    })
+}
+
+/// Whether this is a coalition that is led and whose leader has no entry at present.
+#[must_use]
+pub fn is_leaderless<V: View + ?Sized>(view: &V, name: &str) -> bool {
+    let entry = view.named(name);
+    entry.is_some_and(|entry| match &entry.role {
+        Role::Coalition(members) => coalition::is_leaderless(view, members),
+        _ => false,
     })
 }
 

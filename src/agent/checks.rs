@@ -414,7 +414,9 @@ fn groups<'m>(message: &'m Message, directory: &dyn Directory) -> Vec<(&'m str, 
             Ok(Resolution::Multicast(entries)) => {
                 Some((name, entries.into_iter().map(name_of).collect()))
             }
-            Ok(Resolution::Coalition { agents, missing }) => {
+            Ok(Resolution::Coalition {
+                agents, missing, ..
+            }) => {
                 let agents = agents.into_iter().map(name_of);
                 Some((name, agents.chain(missing).collect()))
             }

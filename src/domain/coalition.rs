@@ -40,12 +40,16 @@ impl Domain {
         options: RegisterOptions,
     ) -> Result<Coalition, CoalitionError> {
         let members = Members::new(members, leader.map(Into::into))?;
-        let registration = Registration {
-            agent_type: options.agent_type,
-            description: options.description,
-            role: Role::Coalition(members.clone()),
-            ..Registration::new(name, Incarnation::random(), Vec::new())
-        };
+        self.form_of(name, members, options)
+    }
+
+    pub(crate) fn form_of(
+        &self,
+        name: &str,
+        members: Members,
+        options: RegisterOptions,
+    ) -> Result<Coalition, CoalitionError> {
+        let registration = registration_of(name, &members, options);
         self.inner.service.host.register(registration.clone())?;
         if let Ok(id) = AgentId::new(name) {
             warn_of_name(&id);
@@ -56,6 +60,15 @@ impl Domain {
             members,
             formed: true,
         })
+    }
+}
+
+fn registration_of(name: &str, members: &Members, options: RegisterOptions) -> Registration {
+    Registration {
+        agent_type: options.agent_type,
+        description: options.description,
+        role: Role::Coalition(members.clone()),
+        ..Registration::new(name, Incarnation::random(), Vec::new())
     }
 }
 
@@ -93,22 +106,32 @@ impl Coalition {
     /// If there are too many members together, or if the directory cannot be written. The error then
     /// contains the other coalition, and both are unchanged.
     pub fn merge(&mut self, mut other: Self) -> Result<(), Box<(CoalitionError, Self)>> {
-        let names = self.members.names().iter().chain(other.members.names());
-        // The other coalition may have been a member of this one.
-        let gone = Arc::clone(&other.registration.name);
-        let names = names.filter(|name| **name != gone).cloned();
+        let names = self.names_with(&other);
         let members = Members::new(names, self.members.leader().cloned());
-        let leaving = [(&*gone, other.registration.incarnation)];
-        let merged = members
-            .map_err(CoalitionError::from)
-            .and_then(|members| self.replace(members, Vec::new(), &leaving));
-        match merged {
-            Ok(()) => {
-                other.formed = false;
-                Ok(())
-            }
+        let members = members.map_err(CoalitionError::from);
+        match members.and_then(|members| self.absorb(members, &mut other)) {
+            Ok(()) => Ok(()),
             Err(error) => Err(Box::new((error, other))),
         }
+    }
+
+    /// Returns the members of this coalition and of another one, which may be a member of this one.
+    pub(crate) fn names_with(&self, other: &Self) -> Vec<Arc<str>> {
+        let names = self.members.names().iter().chain(other.members.names());
+        let stays = |name: &&Arc<str>| **name != other.registration.name;
+        names.filter(stays).cloned().collect()
+    }
+
+    /// Replaces the members and removes the name of another coalition, in one change.
+    pub(crate) fn absorb(
+        &mut self,
+        members: Members,
+        other: &mut Self,
+    ) -> Result<(), CoalitionError> {
+        let leaving = [(&*other.registration.name, other.registration.incarnation)];
+        self.replace(members, Vec::new(), &leaving)?;
+        other.formed = false;
+        Ok(())
     }
 
     /// Moves these members to a new coalition, in one atomic change of the directory. If the leader is
@@ -124,20 +147,36 @@ impl Coalition {
         leader: Option<&str>,
         options: RegisterOptions,
     ) -> Result<Self, CoalitionError> {
-        let is_ours = |name: &&str| self.members.names().iter().any(|ours| **ours == **name);
-        if let Some(foreign) = members.iter().find(|name| !is_ours(name)) {
-            return Err(CoalitionError::NoMember((*foreign).to_owned()));
-        }
+        let staying = self.names_without(members)?;
         let parting = Members::new(members.iter().copied(), leader.map(Into::into))?;
-        let stays = |name: &&Arc<str>| !members.contains(&&***name);
-        let staying = self.members.names().iter().filter(stays).cloned();
-        let staying = Members::new(staying, self.members.leader().filter(stays).cloned())?;
-        let registration = Registration {
-            agent_type: options.agent_type,
-            description: options.description,
-            role: Role::Coalition(parting.clone()),
-            ..Registration::new(name, Incarnation::random(), Vec::new())
-        };
+        let leader = self.members.leader().filter(|it| staying.contains(it));
+        let staying = Members::new(staying.iter().cloned(), leader.cloned())?;
+        self.split_off(name, parting, staying, options)
+    }
+
+    /// Returns the members without these.
+    pub(crate) fn names_without<N: AsRef<str>>(
+        &self,
+        parting: &[N],
+    ) -> Result<Vec<Arc<str>>, CoalitionError> {
+        let names = self.members.names();
+        let is_ours = |name: &&N| names.iter().any(|ours| **ours == *name.as_ref());
+        if let Some(foreign) = parting.iter().find(|name| !is_ours(name)) {
+            return Err(CoalitionError::NoMember(foreign.as_ref().to_owned()));
+        }
+        let stays = |name: &&Arc<str>| !parting.iter().any(|it| *it.as_ref() == ***name);
+        Ok(names.iter().filter(stays).cloned().collect())
+    }
+
+    /// Replaces the members and forms another coalition, in one change.
+    pub(crate) fn split_off(
+        &mut self,
+        name: &str,
+        parting: Members,
+        staying: Members,
+        options: RegisterOptions,
+    ) -> Result<Self, CoalitionError> {
+        let registration = registration_of(name, &parting, options);
         self.replace(staying, vec![registration.clone()], &[])?;
         Ok(Self {
             domain: self.domain.clone(),
@@ -152,11 +191,11 @@ impl Coalition {
     /// # Errors
     /// If the directory cannot be written.
     pub fn dissolve(mut self) -> Result<(), DeregisterError> {
-        self.leave()
+        self.remove()
     }
 
     /// Replaces the members, and forms and removes other coalitions in the same atomic change.
-    fn replace(
+    pub(crate) fn replace(
         &mut self,
         members: Members,
         mut formed: Vec<Registration>,
@@ -173,7 +212,8 @@ impl Coalition {
         Ok(())
     }
 
-    fn leave(&mut self) -> Result<(), DeregisterError> {
+    /// Removes the name from the directory.
+    pub(crate) fn remove(&mut self) -> Result<(), DeregisterError> {
         self.formed = false;
         let Registration {
             name, incarnation, ..
@@ -190,7 +230,7 @@ impl Drop for Coalition {
     fn drop(&mut self) {
         // In a forked child, the coalition still belongs to the parent.
         if self.formed && self.domain.inner.owner.is_this() {
-            match self.leave() {
+            match self.remove() {
                 // Closing the domain has already removed the name.
                 Ok(()) | Err(DeregisterError::Closed) => {}
                 Err(error) => {
@@ -223,4 +263,7 @@ pub enum CoalitionError {
     /// The directory refuses the coalition.
     #[error(transparent)]
     Register(#[from] RegisterError),
+    /// The name cannot be removed from the directory.
+    #[error(transparent)]
+    Deregister(#[from] DeregisterError),
 }

@@ -23,7 +23,7 @@ pub struct Device {
 }
 
 impl Device {
-    pub(super) fn begin(
+    pub(crate) fn begin(
         core: &Arc<AgentCore>,
         owner: &str,
         resource: &str,

@@ -60,12 +60,13 @@ pub use fipa_locking::{
 
 use fipa_locking::{LockStatus, Options, Resource};
 
-use crate::agent::Agent;
+use crate::agent::{Agent, AgentCore};
 
 pub use self::device::Device;
 pub use self::error::{LockError, OwnError};
 pub use self::lock::Lock;
 pub use self::message::{AdmitError, FENCE, fences_of, with_fences};
+pub(crate) use self::owned::listed_owner;
 pub use self::owned::{ENTRY_PREFIX, OwnOptions, Owned, OwnerEvent};
 pub use self::report::ResourceStatus;
 pub use self::state_file::StateFileError;
@@ -178,11 +179,7 @@ impl Agent {
     /// # Errors
     /// If no agent owns the resource, the owner is lost or refuses, or the agent was deregistered.
     pub async fn lock(&self, resource: &str) -> Result<Lock, LockError> {
-        let resource = Resource::new(resource)?;
-        Lock::acquire(&self.core, vec![resource], |core, now, all, out| {
-            core.lock_all(now, all, None, out)
-        })
-        .await
+        acquire(&self.core, Resource::new(resource)?).await
     }
 
     /// Requests a resource, and withdraws the request after `within`.
@@ -267,4 +264,12 @@ impl Agent {
     pub fn device(&self, owner: &str, resource: &str) -> Result<Device, LockError> {
         Device::begin(&self.core, owner, resource)
     }
+}
+
+/// Requests a resource, and waits until the agent holds it.
+pub(crate) async fn acquire(core: &Arc<AgentCore>, resource: Resource) -> Result<Lock, LockError> {
+    Lock::acquire(core, vec![resource], |core, now, all, out| {
+        core.lock_all(now, all, None, out)
+    })
+    .await
 }

@@ -150,7 +150,7 @@ impl Files {
 }
 
 impl Owned {
-    pub(super) async fn begin(
+    pub(crate) async fn begin(
         core: Arc<AgentCore>,
         resource: Resource,
         options: OwnOptions,
@@ -396,7 +396,7 @@ pub(super) fn listed(
 }
 
 /// Returns the owner of a resource and the algorithm that it names, if the directory lists it.
-pub(super) fn listed_owner(
+pub(crate) fn listed_owner(
     directory: DirectoryView<'_>,
     resource: &Resource,
 ) -> Option<(Arc<Entry>, Option<Algorithm>)> {

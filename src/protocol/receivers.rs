@@ -13,7 +13,7 @@ use crate::agent::AgentCore;
 pub(super) struct Expanded {
     /// The agents, each once.
     pub(super) agents: Vec<AgentId>,
-    /// The members of coalitions that are not registered.
+    /// The members of coalitions that are not registered, and coalitions without a present leader.
     pub(super) missing: Vec<String>,
 }
 
@@ -30,8 +30,12 @@ fn expand_in(directory: &dyn Directory, own: &str, receivers: &[AgentId]) -> Exp
     for receiver in receivers {
         let agents: Vec<AgentId> = match resolve(directory, receiver.name(), own) {
             Ok(Resolution::Multicast(entries)) => ids(&entries),
-            Ok(Resolution::Coalition { agents, missing }) => {
-                for member in missing {
+            Ok(Resolution::Coalition {
+                agents,
+                missing,
+                leaderless,
+            }) => {
+                for member in missing.into_iter().chain(leaderless) {
                     if known.insert(member.to_string()) {
                         expanded.missing.push(member.to_string());
                     }

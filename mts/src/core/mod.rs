@@ -14,7 +14,7 @@
 //!
 //! The path of a letter:
 //!
-//! * `waiting`: it waits for a refresh of the directory.
+//! * `waiting`: it waits for a refresh of the directory, or for the next leader of a coalition.
 //! * `lane`: it is among the open letters of one stream, in order, on one route at a time; `lanes` creates,
 //!   visits and drops lanes, `passes` divides visits of all lanes into portions.
 //! * `routes`: the choice of the location that it goes to, and the failures of locations.
@@ -147,6 +147,8 @@ pub struct Core {
     agents: Map<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
     waiting: WaitingLetters,
+    /// Letters to coalitions that have no leader at present, each with one receiver.
+    leaderless: WaitingLetters,
     static_peers: Peers,
     principals: Principals,
     reader: LetterReader,
@@ -193,6 +195,7 @@ impl Core {
             agents: Map::default(),
             timers: BinaryHeap::new(),
             waiting: WaitingLetters::default(),
+            leaderless: WaitingLetters::default(),
             static_peers: Peers::default(),
             principals: Principals::default(),
             reader,
@@ -241,6 +244,10 @@ impl Core {
         // Their sequences are those of the agent.
         for letter in self.waiting.remove(|letter| letter.sender == incarnation) {
             self.fail_unresolved(letter, FailureReason::Closed);
+        }
+        let is_own = |letter: &Unresolved| letter.sender == incarnation;
+        for letter in self.leaderless.remove(is_own) {
+            self.fail_receivers(letter, FailureReason::Closed);
         }
         if let Some(mut inbox) = self.agents.remove(&incarnation) {
             let receiver = Arc::clone(&inbox.name);
@@ -356,10 +363,15 @@ impl Core {
             self.with_lane(now, id, |lane, table| lane.dispatch_all(now.instant, table));
         }
         self.visit_lanes(now);
+        let late = |letter: &Unresolved| letter.deadline <= now.instant;
         if !self.waiting.is_empty() {
-            let late = |letter: &Unresolved| letter.deadline <= now.instant;
             for letter in self.waiting.remove(late) {
                 self.fail_unresolved(letter, FailureReason::TimedOut);
+            }
+        }
+        if !self.leaderless.is_empty() {
+            for letter in self.leaderless.remove(late) {
+                self.fail_receivers(letter, FailureReason::TimedOut);
             }
         }
         self.handle_note_timers(now);
@@ -390,7 +402,8 @@ impl Core {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
         let notes = self.table.notes.due();
         let others = earlier(self.static_peers.due(), self.passes.due());
-        earlier(earlier(lanes, notes), earlier(others, self.waiting.due()))
+        let unresolved = earlier(self.waiting.due(), self.leaderless.due());
+        earlier(earlier(lanes, notes), earlier(others, unresolved))
     }
 
     /// Returns the next action to perform.
@@ -401,7 +414,8 @@ impl Core {
     /// Whether any letter that was sent or taken into custody here has no outcome yet.
     #[must_use]
     pub fn has_open_letters(&self) -> bool {
-        !self.waiting.is_empty() || self.lanes.values().any(|lane| !lane.is_empty())
+        let unresolved = !self.waiting.is_empty() || !self.leaderless.is_empty();
+        unresolved || self.lanes.values().any(|lane| !lane.is_empty())
     }
 
     /// Whether the end of a letter in custody was reported, and the service that handed it over has
@@ -420,6 +434,9 @@ impl Core {
         self.ending = true;
         for letter in self.waiting.remove(|_| true) {
             self.fail_unresolved(letter, FailureReason::Closed);
+        }
+        for letter in self.leaderless.remove(|_| true) {
+            self.fail_receivers(letter, FailureReason::Closed);
         }
         for id in self.lanes_in_order() {
             if let Some(lane) = self.lanes.get_mut(&id) {

@@ -14,6 +14,7 @@ impl Core {
     /// Handles a change of the directory, after [`set_view`](Self::set_view). Of many lanes, this call
     /// visits a portion, and calls of [`handle_timeout`](Self::handle_timeout) visit the others.
     pub fn handle_directory_change(&mut self, now: Now) {
+        self.send_to_leaders(now);
         self.passes.begin(now.instant, Concern::Directory);
         self.visit_lanes(now);
         self.send_failures(now);

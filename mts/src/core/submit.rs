@@ -137,12 +137,11 @@ impl Core {
         unresolved: Unresolved,
         is_fresh: bool,
     ) -> Result<usize, Unresolved> {
+        // Earlier letters to the same coalition go first.
+        self.send_to_leaders(now);
         let view = Arc::clone(&self.table.view);
         let sender = unresolved.sender;
-        let sender_name = self
-            .agents
-            .get(&sender)
-            .map(|inbox| Arc::clone(&inbox.name));
+        let sender_name = self.name_of(sender);
         let own = sender_name.as_deref().unwrap_or_default();
         let mut resolved = Vec::new();
         for receiver in &unresolved.receivers {
@@ -169,10 +168,23 @@ impl Core {
             let entries = match resolution {
                 Resolution::Exact(entry) => vec![entry],
                 Resolution::Multicast(entries) => entries,
-                Resolution::Coalition { agents, missing } => {
-                    count += missing.len();
+                Resolution::Coalition {
+                    agents,
+                    missing,
+                    leaderless,
+                } => {
+                    count += missing.len() + leaderless.len();
                     for member in missing {
                         self.absent(submission, sender, member, letter.clone());
+                    }
+                    for coalition in leaderless {
+                        self.wait_for_leader(Unresolved {
+                            submission,
+                            sender,
+                            letter: letter.clone(),
+                            receivers: vec![coalition],
+                            deadline,
+                        });
                     }
                     if agents.is_empty() {
                         continue;
@@ -199,6 +211,60 @@ impl Core {
         Ok(count)
     }
 
+    fn name_of(&self, sender: Incarnation) -> Option<Arc<str>> {
+        let inbox = self.agents.get(&sender)?;
+        Some(Arc::clone(&inbox.name))
+    }
+
+    /// Keeps a letter to a coalition that has no leader at present. One outcome follows.
+    fn wait_for_leader(&mut self, letter: Unresolved) {
+        let len = letter.letter.len();
+        match self
+            .leaderless
+            .has_room(letter.sender, len, &self.table.config)
+        {
+            true => self.leaderless.push(0, letter),
+            false => self.fail_receivers(letter, FailureReason::QueueFull),
+        }
+    }
+
+    /// Sends the letters to coalitions that have a leader again, in the order in which they were submitted. A letter
+    /// to a coalition that no longer exists fails.
+    pub(super) fn send_to_leaders(&mut self, now: Now) {
+        if self.leaderless.is_empty() {
+            return;
+        }
+        let view = Arc::clone(&self.table.view);
+        let waits = |letter: &Unresolved| {
+            let name = letter.receivers.first();
+            name.is_some_and(|name| fipa_sds::is_leaderless(&*view, name))
+        };
+        for letter in self.leaderless.remove(|letter| !waits(letter)) {
+            let Unresolved {
+                submission,
+                sender,
+                letter,
+                receivers,
+                deadline,
+            } = letter;
+            let own = self.name_of(sender);
+            for receiver in receivers {
+                let own = own.as_deref().unwrap_or_default();
+                match fipa_sds::resolve(&*view, &receiver, own) {
+                    Ok(Resolution::Coalition { agents, .. }) if agents.len() == 1 => {
+                        for entry in agents {
+                            let letter = letter.clone();
+                            self.submit_one(now, (submission, sender), &entry, letter, deadline);
+                        }
+                    }
+                    // The coalition is dissolved, or its leader is several agents.
+                    _ => self.absent(submission, sender, receiver, letter.clone()),
+                }
+            }
+        }
+        self.send_failures(now);
+    }
+
     /// Ends a letter whose receivers were not resolved.
     pub(super) fn fail_unresolved(&mut self, letter: Unresolved, reason: FailureReason) {
         self.table.actions.push_back(Action::Resolved {
@@ -208,7 +274,7 @@ impl Core {
         self.fail_receivers(letter, reason);
     }
 
-    fn fail_receivers(&mut self, letter: Unresolved, reason: FailureReason) {
+    pub(super) fn fail_receivers(&mut self, letter: Unresolved, reason: FailureReason) {
         let Unresolved {
             submission,
             sender,

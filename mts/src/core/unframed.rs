@@ -221,7 +221,9 @@ fn receivers_of(name: Arc<str>, resolution: Resolution) -> Vec<Receiver> {
         Resolution::Coalition {
             agents,
             mut missing,
+            leaderless,
         } => {
+            missing.extend(leaderless);
             // Members on other hosts cannot be reached from here, which the sender is told.
             let away = agents.iter().filter(|entry| entry.reach != Reach::Local);
             missing.extend(away.map(|entry| Arc::clone(&entry.name)));

@@ -1,5 +1,5 @@
 //! Letters that wait until the directory has been refreshed, because their receiver is not in the
-//! view of the directory.
+//! view of the directory; and letters that wait for the next leader of a coalition.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ pub(super) struct Unresolved {
 /// order: later ones wait behind an earlier one, even if their receivers are in the view.
 #[derive(Debug, Default)]
 pub(super) struct WaitingLetters {
-    /// Each with the number of the refresh that it waits for.
+    /// Each with the number of the refresh that it waits for; 0 for the next leader of a coalition.
     letters: VecDeque<(u64, Unresolved)>,
     /// Letters and bytes of each sender.
     senders: Map<Incarnation, (usize, usize)>,

@@ -6,7 +6,8 @@
 //! { "version": 1, "tell": { "full": { "version": 7, "first": true, "last": false, "agents": [agent] } } }
 //! { "version": 1, "tell": { "changes": { "from": 7, "to": 9, "agents": [agent], "left": [name] } } }
 //! agent = { "name", "type", "id", "description", "registered": milliseconds since 1970, UTC,
-//!           "coalition": { "members": [name], "leader": name }, for a coalition
+//!           "coalition": { "members": [name], "leader": name }, for a coalition; "leader" is left out if
+//!                        it is not led, and empty if it has no leader at present
 //!           "df": { "entry": text, "lease": remaining milliseconds }, for an agent with an entry
 //!                 in the directory facilitator of the gateway; "lease" is left out without one }
 //! ```

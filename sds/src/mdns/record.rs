@@ -15,7 +15,7 @@
 //! | `fipa-mts`, `fipa-mts-id` | name and incarnation of the gateway that announces it |
 //! | `fipa-role` | `gateway` or `coalition`, absent for an agent |
 //! | `fipa-members` | names of the members of a coalition, with a line feed between two |
-//! | `fipa-leader` | the name of its leader, if it has one |
+//! | `fipa-leader` | the name of its leader if it is led; empty if it has none at present |
 //! | `fipa-time` | time of registration, in milliseconds since 1970, UTC |
 //! | `fipa-locations` | all locations that lead to this host, in order, with a space between two; link-local IPv6 addresses without a scope |
 //! | `fipa-type`, `fipa-description` | full text, when the legacy key has only its beginning |
@@ -92,8 +92,10 @@ pub(super) fn encode(entry: &Entry) -> Properties {
             own("fipa-role", "coalition");
             // Names have no control characters, so a line feed separates them.
             own("fipa-members", &members.names().join("\n"));
-            if let Some(leader) = members.leader() {
-                own("fipa-leader", leader);
+            match members.leader() {
+                Some(leader) => own("fipa-leader", leader),
+                None if members.is_vacant() => own("fipa-leader", ""),
+                None => {}
             }
         }
     }
@@ -292,8 +294,12 @@ fn own_entry(record: &Record<'_>) -> Result<Entry, RecordError> {
 fn members(record: &Record<'_>) -> Result<Members, RecordError> {
     let key = "fipa-members";
     let names = record.text(key)?.ok_or(RecordError::Missing(key))?;
-    let leader = record.text("fipa-leader")?.map(Into::into);
-    Members::new(names.split('\n'), leader).map_err(|_| RecordError::Value(key))
+    let names = names.split('\n');
+    let members = match record.text("fipa-leader")? {
+        Some(leader) if leader.is_empty() => Members::vacant(names),
+        leader => Members::new(names, leader.map(Into::into)),
+    };
+    members.map_err(|_| RecordError::Value(key))
 }
 
 fn legacy_entry(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
@@ -755,6 +761,7 @@ mod tests {
             gateway: bool,
             members in prop::collection::vec(any_text(200), 0..5),
             led: bool,
+            vacant: bool,
         ) -> Entry {
             let mts = MtsId::new(mts_name, Incarnation::from_u64(mts));
             Entry {
@@ -768,10 +775,13 @@ mod tests {
                 description,
                 registered: time_of_millis(millis),
                 source: Source::Mdns,
-                role: match Members::new(
-                    members.iter().map(String::as_str),
-                    members.first().filter(|_| led).map(|name| name.as_str().into()),
-                ) {
+                role: match match vacant {
+                    true => Members::vacant(members.iter().map(String::as_str)),
+                    false => Members::new(
+                        members.iter().map(String::as_str),
+                        members.first().filter(|_| led).map(|name| name.as_str().into()),
+                    ),
+                } {
                     Ok(members) => Role::Coalition(members),
                     Err(_) if gateway => Role::Gateway,
                     Err(_) => Role::Agent,
