@@ -142,6 +142,8 @@ async fn members_lead_in_their_order_and_refuse_the_commands_of_earlier_leaders(
             ..
         }
     ));
+    here.close().await;
+    there.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -175,6 +177,7 @@ async fn a_letter_to_a_vacant_coalition_fails_at_its_deadline_or_with_the_coalit
             ..
         }
     ));
+    domain.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -234,6 +237,7 @@ async fn coalitions_merge_and_split_in_one_change() {
         .await
         .unwrap_err();
     assert!(twice.to_string().contains("cannot be owned"), "{twice}");
+    domain.close().await;
 }
 
 /// A process with an agent that founds a coalition or takes part in it, and answers letters.

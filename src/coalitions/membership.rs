@@ -255,7 +255,7 @@ impl Member {
     async fn run(mut self) {
         let mut request: Option<Request> = None;
         loop {
-            let turn = self.look();
+            let turn = self.look(request.is_some());
             let now = Instant::now();
             match turn {
                 None => request = None,
@@ -289,8 +289,9 @@ impl Member {
         }
     }
 
-    /// Reads the directory. Returns the time at which this agent asks for the lock, if it is to.
-    fn look(&mut self) -> Option<Instant> {
+    /// Reads the directory. Returns the time at which this agent asks for the lock, if it is to. `requests` tells
+    /// whether it has asked already.
+    fn look(&mut self, requests: bool) -> Option<Instant> {
         let directory = self.core.endpoint.domain.directory();
         let members = directory
             .lookup(&self.name)
@@ -333,8 +334,9 @@ impl Member {
                 self.vacant_since = None;
                 return None;
             }
-            // The founder has granted the request already, or the previous agent of this name was the leader.
-            Some(_) => Duration::ZERO,
+            // The founder has granted the request and listed this agent, or has not listed the end of its lock.
+            Some(_) if requests => Duration::ZERO,
+            Some(_) => return None,
             None => turn,
         };
         let turn = *self.vacant_since.get_or_insert_with(Instant::now) + turn;
