@@ -70,8 +70,8 @@ mod queue;
 mod state_file;
 
 pub use algorithm::{
-    Algorithm, AnyAlgorithm, Context, Gate, Member, MutualExclusion, OwnerQueue, RicartAgrawala,
-    Step, SuzukiKasami,
+    Algorithm, AnyAlgorithm, Context, Member, MutualExclusion, OwnerGate, OwnerQueue,
+    RicartAgrawala, Step, SuzukiKasami,
 };
 pub use fence::{Admission, Fence, FenceError, NotAdmitted};
 pub use holder::{Holder, HolderStep};

@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
 use crate::faults::{Fault, fault};
 use crate::fence::Position;
 use crate::queue::Queue;
-use crate::{Act, Conversation, Fence, Gate, LockPeer, Millis, OwnerState, Refusal, Resource};
+use crate::{Act, Conversation, Fence, LockPeer, Millis, OwnerGate, OwnerState, Refusal, Resource};
 
 /// Highest epoch that a report can have. The clock reaches it in nine million years, and the epochs above
 /// are left to the restarts that follow a false report.
@@ -30,7 +30,7 @@ pub struct Owner {
     /// Random bits of this life.
     run: u64,
     /// Epoch of the last life that the state file of this life knows.
-    before: u64,
+    previous_epoch: u64,
     /// Highest reported epoch of another life.
     reported: Option<u64>,
     /// Epoch that has to be stored before the next grant.
@@ -44,7 +44,7 @@ pub struct Owner {
     no_grants_until: Option<Millis>,
     live: Option<Grant>,
     /// Holder whose grant expired, until it reports or ends.
-    unproved: Option<(LockPeer, Conversation)>,
+    expired_holder: Option<(LockPeer, Conversation)>,
     /// At most one report per registration.
     queue: Queue,
     /// Latest conversation of each agent that has ended.
@@ -143,7 +143,7 @@ impl Owner {
             resource,
             epoch,
             run,
-            before: life.before(),
+            previous_epoch: life.previous_epoch(),
             reported: None,
             storing: None,
             number: 0,
@@ -151,7 +151,7 @@ impl Owner {
             absent_until: (life.absence() > 0).then(|| now.saturating_add(life.absence())),
             no_grants_until: (silence > 0).then(|| now.saturating_add(silence)),
             live: None,
-            unproved: None,
+            expired_holder: None,
             queue: Queue::default(),
             closed: BTreeMap::new(),
             fault,
@@ -180,13 +180,13 @@ impl Owner {
 
     /// Agents that the owner lets pass in the algorithm.
     #[must_use]
-    pub fn gate(&self) -> Gate {
+    pub fn gate(&self) -> OwnerGate {
         if self.live.is_some() || self.no_grants_until.is_some() || self.storing.is_some() {
-            Gate::Closed
-        } else if self.unproved.is_some() {
-            Gate::Own
+            OwnerGate::Closed
+        } else if self.expired_holder.is_some() {
+            OwnerGate::Own
         } else {
-            Gate::Open
+            OwnerGate::Open
         }
     }
 
@@ -195,8 +195,8 @@ impl Owner {
     pub fn poll_timeout(&self) -> Option<Millis> {
         let expires = self.live.as_ref().and_then(|grant| grant.expires);
         let turn = match self.gate() {
-            Gate::Closed => None,
-            Gate::Open | Gate::Own => self.queue.poll_timeout(),
+            OwnerGate::Closed => None,
+            OwnerGate::Open | OwnerGate::Own => self.queue.poll_timeout(),
         };
         expires
             .into_iter()
@@ -238,7 +238,8 @@ impl Owner {
         }
         self.reported = self.reported.max(Some(fence.epoch()));
         // Lives on this host are in the file, with their leases.
-        if fence.epoch() > self.before && self.absent_until.is_some_and(|until| now < until) {
+        if fence.epoch() > self.previous_epoch && self.absent_until.is_some_and(|until| now < until)
+        {
             self.no_grants_until = self.no_grants_until.max(self.absent_until);
         }
     }
@@ -326,7 +327,7 @@ impl Owner {
             // A newer request of the holder: it has left. Its report was lost or is late.
             self.end(Ending::Released, out);
         }
-        self.proved(from, conversation);
+        self.expired_holder_left(from, conversation);
         if !self.queue.add(from, conversation, asked) {
             return;
         }
@@ -365,7 +366,7 @@ impl Owner {
         // Before the timeout, which grants the resource to the next one: a late owner has both to handle.
         self.queue.withdraw(from, conversation);
         self.handle_timeout(now, out);
-        self.proved(from, conversation);
+        self.expired_holder_left(from, conversation);
         let by_name = fault!(self.fault, ReleaseByName);
         let of_live = self.live.as_ref().is_some_and(|live| {
             live.holder == *from && (by_name || live.conversation == *conversation)
@@ -419,8 +420,12 @@ impl Owner {
             if self.live.as_ref().is_some_and(|live| live.holder == *peer) {
                 self.end(Ending::Gone, out);
             }
-            if self.unproved.as_ref().is_some_and(|(of, _)| of == peer) {
-                self.unproved = None;
+            if self
+                .expired_holder
+                .as_ref()
+                .is_some_and(|(of, _)| of == peer)
+            {
+                self.expired_holder = None;
             }
             self.closed.remove(peer);
         }
@@ -432,7 +437,7 @@ impl Owner {
         if self.live.is_some() {
             self.end(Ending::Forced, out);
         }
-        self.unproved = None;
+        self.expired_holder = None;
         self.grant_next(now, out);
     }
 
@@ -447,7 +452,7 @@ impl Owner {
         }
         if over(self.live.as_ref().and_then(|live| live.expires)) {
             if let Some(live) = &self.live {
-                self.unproved = Some((live.holder.clone(), live.conversation.clone()));
+                self.expired_holder = Some((live.holder.clone(), live.conversation.clone()));
             }
             self.end(Ending::Expired, out);
         }
@@ -468,10 +473,10 @@ impl Owner {
     }
 
     /// The agent shows that it has left the conversation whose grant expired.
-    fn proved(&mut self, from: &LockPeer, conversation: &Conversation) {
-        let unproved = self.unproved.as_ref();
-        if unproved.is_some_and(|(peer, of)| peer == from && of.is_not_after(conversation)) {
-            self.unproved = None;
+    fn expired_holder_left(&mut self, from: &LockPeer, conversation: &Conversation) {
+        let expired_holder = self.expired_holder.as_ref();
+        if expired_holder.is_some_and(|(peer, of)| peer == from && of.is_not_after(conversation)) {
+            self.expired_holder = None;
         }
     }
 
@@ -492,7 +497,7 @@ impl Owner {
 
     fn begin_next(&mut self, now: Millis, out: &mut Vec<OwnerStep>) {
         let gate = self.gate();
-        if gate == Gate::Closed {
+        if gate == OwnerGate::Closed {
             return;
         }
         let Some(next) = self.queue.next(now, gate, out) else {

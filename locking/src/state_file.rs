@@ -23,7 +23,7 @@ pub struct OwnerState {
     lease: Millis,
     silence: Millis,
     /// Epoch of the last life of which this state knows.
-    before: u64,
+    previous_epoch: u64,
     run: u64,
     /// Time after the start in which grants of a life elsewhere may be live.
     absence: Millis,
@@ -40,7 +40,7 @@ impl OwnerState {
             epoch: 0,
             lease: 0,
             silence: 0,
-            before: 0,
+            previous_epoch: 0,
             run: 0,
             absence: 0,
             needs_report: false,
@@ -72,7 +72,7 @@ impl OwnerState {
             // A crash during the silence leaves grants of the life before that may still be live.
             lease: lease.max(self.lease),
             silence: self.lease,
-            before: self.epoch,
+            previous_epoch: self.epoch,
             run: 0,
             absence: lease.max(MIN_SILENCE),
             needs_report: false,
@@ -145,8 +145,8 @@ impl OwnerState {
     }
 
     /// Epoch of the last life of which this state knows.
-    pub(crate) fn before(&self) -> u64 {
-        self.before
+    pub(crate) fn previous_epoch(&self) -> u64 {
+        self.previous_epoch
     }
 
     /// Time after the start in which grants of a life elsewhere may be live.

@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_content::{Content, SlDialect, Term, Wff};
 
+use crate::answer;
 use crate::description::{AMS_DESCRIPTION, CONSTRAINTS, Constraints, matches_agent};
-use crate::df::{authorize, result};
 use crate::exception::Exception;
 use crate::matching::max_results;
 use crate::request::{self, Rejection, Request};
@@ -106,16 +106,16 @@ impl Ams {
         let (act, content) = match message.performative() {
             Performative::Request => match self.request(now, asker, message, residents) {
                 Ok(content) => (Performative::Inform, content),
-                Err(rejection) => request::rejected(message, asker, rejection),
+                Err(rejection) => answer::rejected(message, asker, rejection),
             },
             act if request::expects_answer(act) => {
                 let reason = Exception::UnsupportedAct(act.as_str().to_owned());
-                request::rejected(message, asker, reason.into())
+                answer::rejected(message, asker, reason.into())
             }
             _ => return,
         };
-        let answer = request::reply(message, asker, &self.id, act).content(content);
-        self.answers.extend(request::answer(asker, answer));
+        let answer = answer::reply(message, asker, &self.id, act).content(content);
+        self.answers.extend(answer::to_asker(asker, answer));
     }
 
     /// Ends leases.
@@ -249,7 +249,7 @@ impl Ams {
                 let template = AmsDescription::from_term(template)?;
                 let constraints = Constraints::from_term(constraints)?;
                 let found = self.search(asker, &template, &constraints, residents)?;
-                result(request, found, asker.dialect)
+                answer::search_result(request, found, asker.dialect)
             }
             "get-description" => {
                 request.arguments([])?;
@@ -261,8 +261,7 @@ impl Ams {
                 };
                 let action = Box::new(request.action.clone().into());
                 let result = Wff::Result(action, Box::new(value));
-                request::print(asker.dialect, &Content::from(result))
-                    .map_err(|_| Exception::InternalError("cannot answer".to_owned()))
+                answer::printed(asker.dialect, &Content::from(result))
             }
             other => Err(Exception::UnsupportedFunction(other.to_owned())),
         }
@@ -409,7 +408,7 @@ fn is_too_large(description: &AmsDescription) -> bool {
 
 /// Returns the description in the request, which is the asker's own.
 fn own_description(asker: &Asker, request: &Request<'_>) -> Result<AmsDescription, Exception> {
-    authorize(asker, request)?;
+    request::authorize(asker, request)?;
     let [description] = request.arguments([AMS_DESCRIPTION])?;
     let description = AmsDescription::from_term(description)?;
     if description.name.is_none() {

@@ -9,7 +9,8 @@ use std::time::{Duration, Instant};
 use fipa_acl::{AgentId, Message, Performative, Time};
 use fipa_content::{Content, SlDialect, Term, Wff};
 
-use crate::description::{Constraints, described};
+use crate::answer;
+use crate::description::{CONSTRAINTS, Constraints};
 use crate::exception::Exception;
 use crate::matching::{Comparisons, max_results};
 use crate::remote::{self, LocalEntry, RemoteEntry};
@@ -163,7 +164,7 @@ impl Df {
             Performative::Request => {
                 let (act, content) = match self.request(now, asker, message) {
                     Ok(content) => (Performative::Inform, content),
-                    Err(rejection) => request::rejected(message, asker, rejection),
+                    Err(rejection) => answer::rejected(message, asker, rejection),
                 };
                 self.answer(asker, message, act, content);
             }
@@ -171,7 +172,7 @@ impl Df {
             Performative::Cancel => self.cancel(asker, message),
             act if request::expects_answer(act) => {
                 let reason = Exception::UnsupportedAct(act.as_str().to_owned());
-                let (act, content) = request::rejected(message, asker, reason.into());
+                let (act, content) = answer::rejected(message, asker, reason.into());
                 self.answer(asker, message, act, content);
             }
             _ => {}
@@ -448,8 +449,8 @@ impl Df {
     }
 
     fn answer(&mut self, asker: &Asker, message: &Message, act: Performative, content: Vec<u8>) {
-        let answer = request::reply(message, asker, &self.id, act).content(content);
-        self.answers.extend(request::answer(asker, answer));
+        let answer = answer::reply(message, asker, &self.id, act).content(content);
+        self.answers.extend(answer::to_asker(asker, answer));
     }
 
     /// Executes a request and returns the content of the answer.
@@ -472,7 +473,7 @@ impl Df {
     ) -> Result<Vec<u8>, Exception> {
         match &*request.function {
             "register" | "modify" => {
-                authorize(asker, request)?;
+                request::authorize(asker, request)?;
                 let [description] = request.arguments([DESCRIPTION])?;
                 let asked = AgentDescription::from_term(description)?;
                 let (description, ends) = granted(now, asker, asked.clone())?;
@@ -482,8 +483,7 @@ impl Df {
                     false => {
                         let action = request.with_argument(description.to_term());
                         let done = Content::from(Wff::done(action));
-                        request::print(asker.dialect, &done)
-                            .map_err(|_| Exception::InternalError("cannot answer".to_owned()))?
+                        answer::printed(asker.dialect, &done)?
                     }
                 };
                 let position = self.registered;
@@ -501,7 +501,7 @@ impl Df {
                 Ok(done)
             }
             "deregister" => {
-                authorize(asker, request)?;
+                request::authorize(asker, request)?;
                 let [description] = request.arguments([DESCRIPTION])?;
                 let description = AgentDescription::from_term(description)?;
                 if description.name.is_none() {
@@ -512,12 +512,11 @@ impl Df {
                 Ok(request.done.clone())
             }
             "search" => {
-                let [template, constraints] =
-                    request.arguments([DESCRIPTION, crate::description::CONSTRAINTS])?;
+                let [template, constraints] = request.arguments([DESCRIPTION, CONSTRAINTS])?;
                 let template = checked_template(AgentDescription::from_term(template)?)?;
                 let constraints = Constraints::from_term(constraints)?;
                 let found = self.search(&template, &constraints, asker)?;
-                result(request, found, asker.dialect)
+                answer::search_result(request, found, asker.dialect)
             }
             other => Err(Exception::UnsupportedFunction(other.to_owned())),
         }
@@ -659,10 +658,7 @@ impl Df {
         if let Some(id) = &constraints.search_id {
             let (most, longest) = limits::SEARCH_IDS;
             if id.len() > longest {
-                return Err(Exception::unrecognised(
-                    crate::description::CONSTRAINTS,
-                    "search-id",
-                ));
+                return Err(Exception::unrecognised(CONSTRAINTS, "search-id"));
             }
             if self.known_search_ids.contains(&**id) {
                 let words = "search-id already served";
@@ -718,7 +714,7 @@ impl Df {
         let (mut subscription, agreed) = match admitted {
             Ok(read) => read,
             Err(reason) => {
-                let (act, content) = request::rejected(message, asker, reason.into());
+                let (act, content) = answer::rejected(message, asker, reason.into());
                 return self.answer(asker, message, act, content);
             }
         };
@@ -797,7 +793,7 @@ impl Df {
             self.revision += 1;
             let reason = Exception::InternalError(words.to_owned());
             let (asker, message) = (&subscription.asker, &subscription.message);
-            let (act, content) = request::rejected(message, asker, reason.into());
+            let (act, content) = answer::rejected(message, asker, reason.into());
             self.answer(asker, message, act, content);
         }
     }
@@ -822,7 +818,7 @@ impl Df {
             None => {
                 let words = "there is no subscription with this conversation";
                 let reason = Exception::InternalError(words.to_owned());
-                request::rejected(message, asker, Rejection::of(cancel, reason))
+                answer::rejected(message, asker, Rejection::of(cancel, reason))
             }
         };
         self.answer(asker, message, act, content);
@@ -903,8 +899,8 @@ impl Df {
             subscription.not_before = now + limits::NOTIFICATION_PAUSE;
             let (asker, message) = (&subscription.asker, &subscription.message);
             let content = subscription.notification(&found.texts);
-            let notification = request::reply(message, asker, &self.id, Performative::Inform);
-            let answer = request::answer(asker, notification.content(content));
+            let notification = answer::reply(message, asker, &self.id, Performative::Inform);
+            let answer = answer::to_asker(asker, notification.content(content));
             self.answers.extend(answer.map(|answer| PlatformAnswer {
                 notification: Some(*id),
                 ..answer
@@ -941,39 +937,6 @@ impl Found {
         self.bytes += text.len();
         self.texts.push(text);
         true
-    }
-}
-
-/// Returns the content of the answer with the results of a search.
-pub(crate) fn result(
-    request: &Request<'_>,
-    found: Vec<Vec<u8>>,
-    dialect: SlDialect,
-) -> Result<Vec<u8>, Exception> {
-    let unprintable = |_| Exception::InternalError("cannot answer".to_owned());
-    let empty = Wff::Result(
-        Box::new(request.action.clone().into()),
-        Box::new(Term::Sequence(Vec::new())),
-    );
-    let mut text = request::print(dialect, &Content::from(empty)).map_err(unprintable)?;
-    // The text ends with the parentheses of the sequence, the formula and the content.
-    let end = text.split_off(text.len().saturating_sub(3));
-    for description in found {
-        text.push(b' ');
-        text.extend(description);
-    }
-    text.extend(end);
-    Ok(text)
-}
-
-/// Checks that the asker may change the description in the request: its connection proves its name, and
-/// the description is its own. A description without a readable name is refused later, for that.
-pub(crate) fn authorize(asker: &Asker, request: &Request<'_>) -> Result<(), Exception> {
-    let other = described(request.first_argument());
-    let other = other.is_some_and(|agent| !agent.same_agent(&asker.id));
-    match asker.is_proved && !other {
-        true => Ok(()),
-        false => Err(Exception::Unauthorised),
     }
 }
 

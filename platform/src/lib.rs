@@ -84,6 +84,7 @@
 //! from (the gateway in the crate `fipa`).
 
 mod ams;
+mod answer;
 mod client;
 mod description;
 mod df;

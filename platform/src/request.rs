@@ -1,17 +1,15 @@
-//! The parts of requests and answers that both agents share: the order of the checks, and the forms of
-//! the answers (FIPA00023 clause 6.3, FIPA00026).
+//! The parts of requests that both agents share: their reading, and the order of the checks (FIPA00023 clause 6.3,
+//! FIPA00026).
 
-use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
+use fipa_acl::{AgentId, Message, Performative};
 use fipa_content::{
     ActionExpression, Content, ContentExpression, Expression, Printer, Profile, SlDialect, Term,
     Wff,
 };
 
+use crate::description::described;
 use crate::exception::{Exception, repeated};
-use crate::{Asker, ONTOLOGY, PlatformAnswer, limits};
-
-/// Language of answers to messages that name none.
-const LANGUAGE: &str = "fipa-sl0";
+use crate::{Asker, ONTOLOGY, limits};
 
 /// A request whose act, language and content are understood.
 pub(crate) struct Request<'m> {
@@ -181,68 +179,13 @@ pub(crate) fn print(
     Printer::new().dialect(dialect).print(expression)
 }
 
-/// Returns the content of an answer with the reason for which a message was rejected.
-pub(crate) fn rejected(
-    message: &Message,
-    asker: &Asker,
-    rejection: Rejection<'_>,
-) -> (Performative, Vec<u8>) {
-    let Rejection { action, reason } = rejection;
-    let wff = reason.to_wff(asker.dialect);
-    let content = match action {
-        Some(action) => Content::of_refusal(*action, wff),
-        // The messages of JADE's own agents have this form.
-        None if asker.dialect == SlDialect::Jade => Content::from(wff),
-        None => {
-            // The act of sending the message: FIPA00037 clause 3.13.
-            let act = ActionExpression::Action {
-                agent: Term::from(&asker.id),
-                act: Term::functional(repeated(message.performative().as_str()), []),
-            };
-            Content::of_refusal(act, wff)
-        }
-    };
-    let printed = print(asker.dialect, &content);
-    // The action of a request was printed before, and all else is short.
-    let printed = printed.or_else(|_| print(asker.dialect, &Content::from(Wff::Truth(false))));
-    (reason.performative(), printed.unwrap_or_default())
-}
-
-/// Starts an answer to the agent that asked. Its conversation, language and ontology are those of the
-/// message. FIPA00061's `reply-to` is not followed: it would direct answers to agents that did not ask.
-pub(crate) fn reply(
-    message: &Message,
-    asker: &Asker,
-    own: &AgentId,
-    performative: Performative,
-) -> MessageBuilder {
-    let mut answer = Message::builder(performative)
-        .sender(asker.asked(own).clone())
-        .receiver(asker.id.clone())
-        .language(message.language().unwrap_or(LANGUAGE))
-        .ontology(message.ontology().unwrap_or(ONTOLOGY));
-    for (text, set) in [
-        (
-            message.protocol(),
-            MessageBuilder::protocol as fn(MessageBuilder, _) -> _,
-        ),
-        (message.conversation_id(), MessageBuilder::conversation_id),
-        (message.reply_with(), MessageBuilder::in_reply_to),
-    ] {
-        if let Some(text) = text {
-            answer = set(answer, text);
-        }
+/// Checks that the asker may change the description in the request: its connection proves its name, and
+/// the description is its own. A description without a readable name is refused later, for that.
+pub(crate) fn authorize(asker: &Asker, request: &Request<'_>) -> Result<(), Exception> {
+    let other = described(request.first_argument());
+    let other = other.is_some_and(|agent| !agent.same_agent(&asker.id));
+    match asker.is_proved && !other {
+        true => Ok(()),
+        false => Err(Exception::Unauthorised),
     }
-    answer
-}
-
-/// Returns an answer to the agent that asked. A message that cannot be built, because the request has a
-/// parameter that no encoding has, is not answered.
-pub(crate) fn answer(asker: &Asker, message: MessageBuilder) -> Option<PlatformAnswer> {
-    Some(PlatformAnswer {
-        to: asker.id.name().into(),
-        registration: asker.registration,
-        message: message.build().ok()?,
-        notification: None,
-    })
 }

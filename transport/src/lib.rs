@@ -14,6 +14,7 @@
 //! Sockets, shared memory, routes and retries belong to other crates. A transport tries once and
 //! reports; retries, other routes and order belong to the delivery core.
 
+mod conclusion;
 #[cfg(feature = "conformance")]
 pub mod conformance;
 mod error;
@@ -34,6 +35,7 @@ mod token_bucket;
 mod transport;
 pub mod wire;
 
+pub use conclusion::{Abandoned, Answer, Conclusion};
 pub use error::{ListenError, TransportError, TransportErrorKind};
 pub use faulty::{Fault, Faulty};
 pub use fnv::fnv1a;
@@ -47,6 +49,6 @@ pub use principal::Principal;
 pub use quota_address::{quota_address, scoped_quota_address};
 pub use token_bucket::TokenBucket;
 pub use transport::{
-    Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, LegacySource,
-    LoanedContent, Mandate, Reaction, Sink, Ticket, Transport,
+    Arrival, Arriving, AttemptId, Hop, Introduction, LegacySource, LoanedContent, Mandate,
+    Reaction, Sink, Ticket, Transport,
 };

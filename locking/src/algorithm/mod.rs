@@ -99,7 +99,7 @@ impl fmt::Display for Algorithm {
 /// algorithm as if it had entered itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 #[allow(clippy::exhaustive_enums, reason = "all combinations that occur")]
-pub enum Gate {
+pub enum OwnerGate {
     /// All agents. It is always open at an agent that does not own the resource.
     #[default]
     Open,
@@ -110,7 +110,7 @@ pub enum Gate {
     Closed,
 }
 
-impl Gate {
+impl OwnerGate {
     /// Whether an agent may pass.
     #[must_use]
     pub fn lets_pass(self, dialect: LockDialect) -> bool {
@@ -141,7 +141,7 @@ pub struct Context<'a> {
     /// Owner of the resource, if it is known.
     pub owner: Option<&'a LockPeer>,
     /// Agents that this agent lets pass.
-    pub gate: Gate,
+    pub gate: OwnerGate,
     /// Lease of a grant.
     pub lease: Millis,
     /// Time after which a request without an answer is repeated.

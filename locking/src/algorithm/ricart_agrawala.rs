@@ -15,7 +15,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::{Algorithm, Context, MutualExclusion, Step};
 use crate::faults::fault;
-use crate::{Act, Conversation, Gate, LockDialect, LockPeer, Millis};
+use crate::{Act, Conversation, LockDialect, LockPeer, Millis, OwnerGate};
 
 /// Maximum clock: `distributed_locking` reads a 32-bit integer. Clocks that have reached it are equal,
 /// and the order is that of the agents.
@@ -215,7 +215,7 @@ impl MutualExclusion for RicartAgrawala {
     }
 
     fn gate_changed(&mut self, context: &Context<'_>, out: &mut Vec<Step>) {
-        if context.gate != Gate::Closed {
+        if context.gate != OwnerGate::Closed {
             self.answer_deferred(context, out);
         }
     }

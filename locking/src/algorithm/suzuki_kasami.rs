@@ -21,7 +21,7 @@ use std::sync::Arc;
 
 use super::{Algorithm, Context, MutualExclusion, Step};
 use crate::faults::fault;
-use crate::{Act, Conversation, Gate, LockDialect, LockPeer, Millis, Token};
+use crate::{Act, Conversation, LockDialect, LockPeer, Millis, OwnerGate, Token};
 
 /// Maximum number of a request: `distributed_locking` reads a 32-bit integer.
 const MAX_NUMBER: u64 = i32::MAX as u64;
@@ -171,7 +171,7 @@ impl SuzukiKasami {
         };
         let next = match context.gate {
             // The first agent waits for the end of the live grant, and so do those behind it.
-            Gate::Closed => {
+            OwnerGate::Closed => {
                 let first = token
                     .queue
                     .iter()
@@ -271,7 +271,7 @@ impl SuzukiKasami {
 
     /// Replaces the token that another agent has, if it may be replaced.
     fn replace(&mut self, context: &Context<'_>, out: &mut Vec<Step>) {
-        if context.gate == Gate::Closed || !self.away.as_ref().is_some_and(|away| away.over) {
+        if context.gate == OwnerGate::Closed || !self.away.as_ref().is_some_and(|away| away.over) {
             return;
         }
         if let Some(away) = self.away.take() {
@@ -438,7 +438,7 @@ impl MutualExclusion for SuzukiKasami {
     }
 
     fn gate_changed(&mut self, context: &Context<'_>, out: &mut Vec<Step>) {
-        if context.gate != Gate::Closed {
+        if context.gate != OwnerGate::Closed {
             self.replace(context, out);
             self.pass(context, out);
         }

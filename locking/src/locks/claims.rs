@@ -5,7 +5,7 @@ use super::event::{Action, Event, Failure};
 use super::request::{Current, Phase};
 use super::{Actions, Locks};
 use crate::holder::Holder;
-use crate::{Fence, Gate, Millis, MutualExclusion, Resource};
+use crate::{Fence, Millis, MutualExclusion, OwnerGate, Resource};
 
 impl<A: MutualExclusion> Locks<A> {
     /// Requests a resource. Fails after `within`, if it is given.
@@ -23,7 +23,7 @@ impl<A: MutualExclusion> Locks<A> {
     /// ([`Options::retry`](crate::Options::retry)), or at once if the resource is in use here.
     pub fn try_lock(&mut self, now: Millis, resource: &Resource, out: &mut Actions) -> ClaimId {
         let busy = self.resources.get(resource).is_some_and(|entry| {
-            entry.current.is_some() || !entry.waiting.is_empty() || entry.gate == Gate::Closed
+            entry.current.is_some() || !entry.waiting.is_empty() || entry.gate == OwnerGate::Closed
         });
         let greeting = self.greeted.poll_timeout().unwrap_or(now);
         let round = greeting

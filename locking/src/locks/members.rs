@@ -5,7 +5,7 @@ use super::request::Phase;
 use super::{Actions, Locks};
 use crate::algorithm::Member;
 use crate::faults::fault;
-use crate::{Act, LockDialect, LockPeer, Millis, MutualExclusion, Resource};
+use crate::{Act, Algorithm, LockDialect, LockPeer, Millis, MutualExclusion, Resource};
 
 /// Maximum number of members. Messages of further agents are ignored.
 const MAX_MEMBERS: usize = 4096;
@@ -163,5 +163,20 @@ impl<A: MutualExclusion> Locks<A> {
         self.at_algorithm(now, resource, out, |algorithm, context, steps| {
             algorithm.lost(context, peer, gone, steps);
         });
+    }
+
+    /// Handles a sign of life of a member that was suspected.
+    pub(super) fn alive_again(&mut self, now: Millis, peer: &LockPeer, out: &mut Actions) {
+        let owned = self.resources.iter().filter(|(_, entry)| {
+            let core = entry.owned.as_ref().map(|owned| &owned.core);
+            entry.kind == Algorithm::OwnerQueue
+                && core.is_some_and(|core| core.waiters().any(|waiter| waiter == peer))
+        });
+        let owned: Vec<_> = owned.map(|(resource, _)| resource.clone()).collect();
+        for resource in owned {
+            self.at_owner(&resource, out, |core, steps| {
+                core.sign_of_life(now, peer, steps)
+            });
+        }
     }
 }

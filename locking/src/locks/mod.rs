@@ -1,13 +1,14 @@
 //! The core of one agent: requester, member, owner and holder of any number of resources.
 
+mod algorithm_choice;
 mod claim;
 mod claims;
 mod discovery;
 mod event;
+mod lost_owner;
 mod members;
 mod mutual_exclusion;
 mod owning;
-mod queued;
 #[cfg(test)]
 mod rebase;
 mod request;
@@ -19,15 +20,15 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
 use self::claim::Claim;
+use self::lost_owner::Former;
 use self::owning::Owned;
-use self::queued::Former;
 use self::request::{Current, Phase};
 use crate::algorithm::Member;
 use crate::greeted::Greeted;
 use crate::probes::{ProbeStep, Probes};
 use crate::{
-    Act, Algorithm, Content, Conversation, Fence, Gate, LockDialect, LockMessage, LockPeer, Millis,
-    MutualExclusion, Options, Resource,
+    Act, Algorithm, Content, Conversation, Fence, LockDialect, LockMessage, LockPeer, Millis,
+    MutualExclusion, Options, OwnerGate, Resource,
 };
 
 pub use self::claim::ClaimId;
@@ -85,7 +86,7 @@ struct Entry<A> {
     /// The request that waited at an owner that is lost.
     former: Option<Former>,
     /// The gate that the algorithm was told.
-    gate: Gate,
+    gate: OwnerGate,
     algorithm: A,
     waiting: VecDeque<ClaimId>,
     current: Option<Current>,
@@ -321,7 +322,7 @@ impl<A: MutualExclusion> Locks<A> {
                 seen: BTreeMap::new(),
                 kind,
                 former: None,
-                gate: Gate::Open,
+                gate: OwnerGate::Open,
                 algorithm: A::new(kind, me.clone(), false),
                 waiting: VecDeque::new(),
                 current: None,

@@ -3,7 +3,7 @@
 use super::{Actions, Locks, MAX_FOREIGN, Received};
 use crate::algorithm::{Context, Step};
 use crate::faults::fault;
-use crate::{Act, Gate, LockDialect, Millis, MutualExclusion, Resource};
+use crate::{Act, LockDialect, Millis, MutualExclusion, OwnerGate, Resource};
 
 impl<A: MutualExclusion> Locks<A> {
     pub(super) fn for_algorithm(&mut self, now: Millis, received: Received<'_>, out: &mut Actions) {
@@ -67,7 +67,7 @@ impl<A: MutualExclusion> Locks<A> {
             return;
         };
         let owned = entry.owned.as_ref();
-        let gate = owned.map_or(Gate::Open, |owned| owned.core.gate());
+        let gate = owned.map_or(OwnerGate::Open, |owned| owned.core.gate());
         if gate != entry.gate {
             entry.gate = gate;
             self.at_algorithm(now, resource, out, |algorithm, context, steps| {

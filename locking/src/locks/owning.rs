@@ -5,7 +5,7 @@ use super::{Actions, Locks, Received};
 use crate::faults::fault;
 use crate::owner::{Grant, Owner, OwnerStep};
 use crate::{
-    Act, Algorithm, Fence, Gate, LockDialect, LockPeer, Millis, MutualExclusion, OwnerState,
+    Act, Algorithm, Fence, LockDialect, LockPeer, Millis, MutualExclusion, OwnerGate, OwnerState,
     Refusal, Resource,
 };
 
@@ -92,7 +92,7 @@ impl<A: MutualExclusion> Locks<A> {
         let Some(owned) = owned else {
             return true;
         };
-        let was_silent = owned.core.gate() == Gate::Closed;
+        let was_silent = owned.core.gate() == OwnerGate::Closed;
         if let Some(last) = owned.core.last() {
             self.remember(&last);
         }

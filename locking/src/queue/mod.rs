@@ -13,7 +13,7 @@
 use std::collections::VecDeque;
 
 use crate::owner::OwnerStep;
-use crate::{Act, Conversation, Gate, LockDialect, LockPeer, Millis};
+use crate::{Act, Conversation, LockDialect, LockPeer, Millis, OwnerGate};
 
 /// Highest place in an owner's queue that a member is told.
 pub const MAX_PLACE: u32 = 8;
@@ -164,7 +164,7 @@ impl Queue {
     pub(crate) fn next(
         &mut self,
         now: Millis,
-        gate: Gate,
+        gate: OwnerGate,
         out: &mut Vec<OwnerStep>,
     ) -> Option<usize> {
         let Some(rules) = self.rules else {

@@ -133,7 +133,7 @@ fn random_requests_losses_and_signs_of_life_keep_the_order() {
                     expected.sign_of_life(agent);
                 }
                 _ => {
-                    let next = queue.next(now, Gate::Open, &mut out);
+                    let next = queue.next(now, OwnerGate::Open, &mut out);
                     let served = next.and_then(|next| queue.remove(next));
                     let (due, asked) = expected.next(now);
                     assert_eq!(served.map(|it| it.peer), due.map(peer), "seed {seed}");
@@ -172,7 +172,7 @@ fn random_requests_losses_and_signs_of_life_keep_the_order() {
             queue.lost(&peer(agent), false);
         }
         for _ in 0..3 * 14 {
-            let next = queue.next(now, Gate::Open, &mut Vec::new());
+            let next = queue.next(now, OwnerGate::Open, &mut Vec::new());
             assert_eq!(next, None);
             now += TIMEOUT;
         }

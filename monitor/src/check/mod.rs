@@ -104,7 +104,12 @@ impl Monitor {
         })
     }
 
-    pub(crate) fn take(&mut self, header: &Header<'_>, now: Moment) -> Result<Passed, Denied> {
+    /// Finds the conversation of a message, judges the message, and applies its changes if it is accepted.
+    pub(crate) fn judge_and_apply(
+        &mut self,
+        header: &Header<'_>,
+        now: Moment,
+    ) -> Result<Passed, Denied> {
         let unchecked = |why| Err(Denied::Unchecked(why));
         let Some(id) = header.conversation() else {
             return Err(self.without_conversation(header));

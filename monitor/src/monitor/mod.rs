@@ -195,7 +195,7 @@ impl Monitor {
     pub fn check(&mut self, header: &Header<'_>, now: impl Into<Moment>) -> Verdict<'_> {
         let now = now.into();
         self.last = now;
-        match self.take(header, now) {
+        match self.judge_and_apply(header, now) {
             Ok(passed) => self.accepted(&passed),
             Err(denied) => self.denied(header, denied),
         }

@@ -99,8 +99,14 @@ impl Core {
         }
         let registration = label.stream.receiver;
         let Some(inbox) = self.agents.get_mut(&registration) else {
+            // A service that does not forward has not read the envelope.
+            let (parts, envelope) = read.map_or((None, None), |read| (read.parts, read.envelope));
+            let Some(envelope) = envelope else {
+                let why = "the agent is no longer in this process";
+                return Reaction::Now(Answer::failed(FailureReason::NoSuchAgent, why));
+            };
             let link = ArrivalLink { via, from, ticket };
-            let reaction = self.forward(now, link, label, letter, read);
+            let reaction = self.forward(now, link, label, letter, (envelope, parts));
             self.send_failures(now);
             return reaction;
         };

@@ -14,7 +14,8 @@ use super::inbox::link_of;
 use super::label::{ArrivalLink, Label};
 use super::lane::OpenLetter;
 use super::origin::{Origin, Upstream};
-use super::{Core, MAX_DEADLINE, News, Now, ReadLetter};
+use super::{Core, MAX_DEADLINE, News, Now};
+use crate::LetterParts;
 use crate::stamp::{self, EnvelopeParts};
 
 /// Time after which a sender is told that its letter is in custody, unless its outcome is known
@@ -29,25 +30,16 @@ const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
 
 impl Core {
     /// Takes a letter for an agent of another process into custody, or returns the reason why not.
-    /// `read` has the parts of the letter.
     pub(super) fn forward(
         &mut self,
         now: Now,
         link: ArrivalLink,
         label: &Label,
         letter: Letter,
-        read: Option<Box<ReadLetter>>,
+        (envelope, parts): (Result<EnvelopeParts, DecodeError>, Option<LetterParts>),
     ) -> Reaction {
         let ArrivalLink { via, from, ticket } = link;
         let unanswered = ticket.map(|ticket| (via, ticket));
-        let (parts, envelope) = match read {
-            Some(read) => (read.parts, read.envelope),
-            None => (None, None),
-        };
-        let Some(envelope) = envelope else {
-            let why = "the agent is no longer in this process";
-            return Reaction::Now(Answer::failed(FailureReason::NoSuchAgent, why));
-        };
         let receiver = self.find_receiver(now, label, &from);
         let stamped =
             receiver.and_then(|entry| Ok((entry, self.stamped(now, letter, envelope, &from)?)));

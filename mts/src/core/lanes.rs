@@ -7,9 +7,9 @@ use std::time::Duration;
 use fipa_sds::{Entry, Role};
 use fipa_transport::{Incarnation, Location, Stream};
 
-use super::attempts::AttemptTable;
 use super::ids::{LaneId, LaneKey, registration_of};
 use super::lane::{Lane, OpenLetter, PauseEnd};
+use super::lane_table::LaneTable;
 use super::passes::{Concern, Step};
 use super::{Core, Now, work};
 
@@ -72,7 +72,7 @@ impl Core {
         &mut self,
         now: Now,
         id: LaneId,
-        work: impl FnOnce(&mut Lane, &mut AttemptTable),
+        work: impl FnOnce(&mut Lane, &mut LaneTable),
     ) {
         let Some(lane) = self.lanes.get_mut(&id) else {
             return;
@@ -167,9 +167,9 @@ impl Core {
     }
 
     /// Whether another letter of this process can wait in this lane.
-    pub(super) fn holds_back(&self, now: Now, lane: LaneId, len: usize) -> bool {
+    pub(super) fn has_room_to_wait(&self, now: Now, lane: LaneId, len: usize) -> bool {
         let lane = self.lanes.get(&lane);
-        lane.is_some_and(|lane| lane.holds_back(now.instant, len, &self.table))
+        lane.is_some_and(|lane| lane.has_room_to_wait(now.instant, len, &self.table))
     }
 
     /// Whether this lane has room for a letter whose sender cannot be held back.

@@ -48,7 +48,6 @@
 
 mod action;
 mod arrival;
-mod attempts;
 mod config;
 mod contacts;
 mod custody;
@@ -59,6 +58,7 @@ mod inbox;
 mod label;
 mod lane;
 mod lane_budget;
+mod lane_table;
 mod lanes;
 mod limits;
 mod network;
@@ -93,7 +93,6 @@ use fipa_sds::View;
 use fipa_transport::{AttemptId, Conclusion, FailureReason, Incarnation, Kind};
 
 pub use self::action::Action;
-use self::attempts::{AttemptTable, Purpose};
 pub use self::config::{CoreConfig, MAX_DEADLINE, RouteException};
 pub use self::failures::Undecodable;
 pub use self::ids::SubmissionId;
@@ -101,6 +100,7 @@ use self::ids::{LaneId, LaneKey};
 use self::inbox::Inbox;
 pub use self::inbox::Received;
 use self::lane::{Lane, PauseEnd};
+use self::lane_table::{LaneTable, Purpose};
 use self::lanes::{IDLE_LANES, LANES_AT_ONCE};
 use self::limits::{FailureLimit, SenderLimit};
 use self::passes::Passes;
@@ -137,7 +137,7 @@ impl Now {
 
 /// The delivery core. See the module documentation.
 pub struct Core {
-    table: AttemptTable,
+    table: LaneTable,
     /// In boxes: a table that grows moves its values, under the lock.
     lanes: Map<LaneId, Box<Lane>>,
     /// In the order of creation, so that runs with one seed are equal.
@@ -187,7 +187,7 @@ impl Core {
     pub fn new(config: CoreConfig, view: Arc<dyn View>) -> Self {
         let reader = LetterReader::new(&config);
         Self {
-            table: AttemptTable::new(config, view),
+            table: LaneTable::new(config, view),
             lanes: Map::default(),
             lane_order: BTreeSet::new(),
             passes: Passes::default(),

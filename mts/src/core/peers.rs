@@ -16,7 +16,7 @@ use fipa_transport::{
     TransportErrorKind, log_limit,
 };
 
-use super::attempts::{AttemptTable, Purpose};
+use super::lane_table::{LaneTable, Purpose};
 use super::notes::note_parcel;
 
 /// A message transport service in the configuration.
@@ -95,7 +95,7 @@ enum State {
 
 impl Peers {
     /// Replaces the list of peers. Peers on both lists keep their state.
-    pub(super) fn set(&mut self, now: Instant, peers: Vec<Peer>, table: &mut AttemptTable) {
+    pub(super) fn set(&mut self, now: Instant, peers: Vec<Peer>, table: &mut LaneTable) {
         let mut before = std::mem::take(&mut self.all);
         for peer in peers {
             let same = before
@@ -120,7 +120,7 @@ impl Peers {
     }
 
     /// Applies a new order of transports.
-    pub(super) fn reorder(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(super) fn reorder(&mut self, now: Instant, table: &mut LaneTable) {
         for static_peer in &mut self.all {
             static_peer.order(now, table);
         }
@@ -146,7 +146,7 @@ impl Peers {
     }
 
     /// Checks all peers at once, because this host's network has changed.
-    pub(super) fn ask_again(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(super) fn ask_again(&mut self, now: Instant, table: &mut LaneTable) {
         let candidates = self
             .all
             .iter_mut()
@@ -163,7 +163,7 @@ impl Peers {
         self.due
     }
 
-    pub(super) fn handle_timeout(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(super) fn handle_timeout(&mut self, now: Instant, table: &mut LaneTable) {
         if self.due.is_none_or(|due| due > now) {
             return;
         }
@@ -193,7 +193,7 @@ impl Peers {
         now: Instant,
         (peer, attempt): (u64, AttemptId),
         conclusion: Conclusion,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         let Some(static_peer) = self
             .all
@@ -223,7 +223,7 @@ impl Peers {
             .collect()
     }
 
-    fn ask_those_due(&mut self, now: Instant, table: &mut AttemptTable) {
+    fn ask_those_due(&mut self, now: Instant, table: &mut LaneTable) {
         for static_peer in &mut self.all {
             static_peer.ask_those_due(now, table);
         }
@@ -246,7 +246,7 @@ impl StaticPeer {
     }
 
     /// Sorts the locations by the order of transports, which may have changed.
-    fn order(&mut self, now: Instant, table: &mut AttemptTable) {
+    fn order(&mut self, now: Instant, table: &mut LaneTable) {
         let mut before = std::mem::take(&mut self.candidates);
         let order = table.config.order.iter();
         let listed = order.flat_map(|kind| {
@@ -286,7 +286,7 @@ impl StaticPeer {
         self.candidates.iter().filter_map(due).min()
     }
 
-    fn ask_those_due(&mut self, now: Instant, table: &mut AttemptTable) {
+    fn ask_those_due(&mut self, now: Instant, table: &mut LaneTable) {
         let (id, name, answers) = (self.id, &self.peer.name, &self.answers);
         let of_use = |candidate: &&mut PeerLocation| {
             answers.as_ref().is_none_or(|at| *at == candidate.location)
@@ -381,7 +381,7 @@ impl PeerLocation {
         }
     }
 
-    fn ask(&mut self, now: Instant, (peer, name): (u64, &Arc<str>), table: &mut AttemptTable) {
+    fn ask(&mut self, now: Instant, (peer, name): (u64, &Arc<str>), table: &mut LaneTable) {
         let no_stream = Stream::between(Incarnation::UNKNOWN, Incarnation::UNKNOWN);
         let parcel = note_parcel(no_stream, Arc::clone(name), 0, Body::Credit);
         let attempt = table.next_attempt();
@@ -395,7 +395,7 @@ impl PeerLocation {
         };
     }
 
-    fn give_up(self, table: &mut AttemptTable) {
+    fn give_up(self, table: &mut LaneTable) {
         if let State::Asked { attempt, .. } = self.state {
             table.drop_attempt(self.location.clone(), attempt);
         }

@@ -8,8 +8,8 @@ use fipa_sds::{Entry, Reach, Resolution, Role};
 use fipa_transport::{Incarnation, Kind, Location};
 use serde::{Deserialize, Serialize};
 
-use super::attempts::AttemptTable;
 use super::ids::registration_of;
+use super::lane_table::LaneTable;
 use super::routes::leads_to_letters;
 use super::{Core, Now};
 use crate::{Map, stamp};
@@ -87,7 +87,7 @@ pub struct RouteState {
     pub last_error_seconds: Option<u64>,
 }
 
-impl AttemptTable {
+impl LaneTable {
     /// The route that letters to this agent would take now.
     pub(super) fn route(&self, now: Instant, entry: &Entry) -> Route {
         let (exception, order) = self.config.route_for(&entry.name, entry.reach);

@@ -7,12 +7,12 @@ use fipa_transport::{Answer, Body, Outcome, Parcel, Report, Stream};
 
 use super::News;
 use super::action::Action;
-use super::attempts::AttemptTable;
 use super::lane::OpenLetter;
+use super::lane_table::LaneTable;
 use super::notes::{Note, note_parcel};
 use super::origin::{Origin, Settlement, Upstream};
 
-impl AttemptTable {
+impl LaneTable {
     /// Reports the end of a letter to its sender, or to the services that handed it over.
     pub(crate) fn settle(
         &mut self,

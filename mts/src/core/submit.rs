@@ -336,7 +336,7 @@ impl Core {
             return self.undeliverable(submission, sender, Arc::clone(name), letter, reason);
         }
         let lane = self.lane(now, own_lane(sender, entry), name);
-        if !self.holds_back(now, lane, letter.len()) {
+        if !self.has_room_to_wait(now, lane, letter.len()) {
             let reason = FailureReason::QueueFull;
             return self.undeliverable(submission, sender, Arc::clone(name), letter, reason);
         }

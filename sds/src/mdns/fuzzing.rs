@@ -11,7 +11,7 @@ use fipa_transport::{Incarnation, PeerId};
 use super::beacon::{self, Beacons};
 use super::browse::{Browser, Found, Origin, label_of};
 use super::coalition_sync::CoalitionSync;
-use super::peer_records::PeerRecords;
+use super::verification::Verification;
 use super::{packet, record};
 use crate::{Entry, Reach, Source};
 
@@ -20,7 +20,7 @@ use crate::{Entry, Reach, Source};
 pub struct Listener {
     browser: Browser,
     beacons: Beacons,
-    peer_records: PeerRecords,
+    verification: Verification,
     coalition_sync: CoalitionSync,
     /// Full names that were found and not removed.
     found: BTreeSet<String>,
@@ -43,7 +43,7 @@ impl Listener {
         Self {
             browser: Browser::new(now, Incarnation::from_u64(1), 0.5),
             beacons: Beacons::default(),
-            peer_records: PeerRecords::default(),
+            verification: Verification::default(),
             coalition_sync: CoalitionSync::default(),
             found: BTreeSet::new(),
         }
@@ -55,7 +55,7 @@ impl Listener {
             let _ = self
                 .coalition_sync
                 .handle_beacon(now, gateway, content.coalitions);
-            let stored = self.peer_records.of(gateway);
+            let stored = self.verification.of(gateway);
             let _ = self.beacons.handle(now, gateway, content.all, stored);
             self.browser.confirm(now, gateway);
         }
@@ -78,7 +78,7 @@ impl Listener {
             let entry = match record::decode(label_of(&fullname), &properties, at) {
                 Ok(entry) => entry,
                 Err(error) => {
-                    self.peer_records.put(now, &fullname, None);
+                    self.verification.put(now, &fullname, None);
                     let _ = self.coalition_sync.put(now, &fullname, None);
                     drop(error.to_string());
                     continue;
@@ -97,7 +97,7 @@ impl Listener {
                 ..entry
             };
             self.browser.belongs(&fullname, entry.mts.incarnation);
-            self.peer_records.put(now, &fullname, Some(&entry));
+            self.verification.put(now, &fullname, Some(&entry));
             let _ = self
                 .coalition_sync
                 .put(now, &fullname, Some(Arc::new(entry)));
@@ -120,7 +120,7 @@ impl Listener {
             for fullname in due.gone {
                 let was_found = self.found.remove(&*fullname);
                 assert!(was_found, "{fullname} was removed but never found");
-                self.peer_records.put(*now, &fullname, None);
+                self.verification.put(*now, &fullname, None);
                 let _ = self.coalition_sync.put(*now, &fullname, None);
             }
             let _ = self.coalition_sync.handle_timeout(*now);

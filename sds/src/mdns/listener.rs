@@ -78,7 +78,7 @@ impl Listener {
             let beacon = beacon::packet(shared.config.mts.incarnation, shared.announced());
             self.send(beacon);
             self.beacons
-                .expect(now, shared.peer_records.lock().gateways());
+                .expect(now, shared.verification.lock().gateways());
             for silent in self.beacons.silent(now) {
                 self.repair(shared, silent);
             }
@@ -89,7 +89,7 @@ impl Listener {
             self.browser.report_again(&label);
         }
         let (ended, suspect) = {
-            let mut stored = shared.peer_records.lock();
+            let mut stored = shared.verification.lock();
             (stored.take_ended(), stored.due(now))
         };
         self.browser.end(now, &ended);
@@ -99,7 +99,7 @@ impl Listener {
         for fullname in due.gone {
             shared.put(&fullname, None);
         }
-        let later = shared.peer_records.lock().poll_timeout(now);
+        let later = shared.verification.lock().poll_timeout(now);
         let relocated = shared.own.lock().relocations.poll_timeout();
         let due = [
             Some(self.browser.poll_timeout()),
@@ -155,7 +155,7 @@ impl Listener {
     ) {
         shared
             .show(|coalition_sync| coalition_sync.handle_beacon(now, gateway, content.coalitions));
-        let stored = shared.peer_records.lock().of(gateway);
+        let stored = shared.verification.lock().of(gateway);
         if let Some(stored) = stored
             && stored.digest == content.all
             && stored.digest != Digest::default()
@@ -177,9 +177,9 @@ impl Listener {
                 let question = self.browser.ask_for_missing(Instant::now());
                 self.send(question);
             }
-            Repair::Surplus(gateway) => shared.peer_records.lock().verify_all(gateway),
+            Repair::Surplus(gateway) => shared.verification.lock().verify_all(gateway),
             Repair::Silent(gateway) => {
-                shared.peer_records.lock().suspect(Instant::now(), gateway);
+                shared.verification.lock().suspect(Instant::now(), gateway);
             }
         }
     }

@@ -18,13 +18,13 @@ pub(crate) mod fuzzing;
 mod listener;
 mod pace;
 mod packet;
-mod peer_records;
 mod probe;
 mod record;
 mod relocations;
 mod restart;
 mod sockets;
 mod task;
+mod verification;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -39,9 +39,9 @@ use tokio::sync::{Notify, watch};
 use self::beacon::Digest;
 use self::coalition_sync::{CoalitionSync, Updates};
 use self::pace::Pace;
-use self::peer_records::PeerRecords;
 pub use self::probe::{Multicast, probe};
 use self::relocations::Relocations;
+use self::verification::Verification;
 use crate::table::Table;
 use crate::{
     DeregisterError, Directory, Entry, MtsId, RegisterError, Registration, Role, Source,
@@ -138,7 +138,7 @@ impl MdnsDirectory {
             daemon: Mutex::new(daemon),
             config,
             table: Table::new(),
-            peer_records: Mutex::default(),
+            verification: Mutex::default(),
             coalition_sync: Mutex::default(),
             coalitions_changed: AtomicBool::new(false),
             closing: AtomicBool::new(false),
@@ -183,7 +183,7 @@ impl MdnsDirectory {
         };
         match entry.mts.incarnation {
             Incarnation::UNKNOWN => {
-                self.shared.peer_records.lock().verify(&fullname);
+                self.shared.verification.lock().verify(&fullname);
                 self.shared.postponed.notify_one();
             }
             gateway => self.verify_gateway(gateway),
@@ -195,7 +195,7 @@ impl MdnsDirectory {
     pub fn verify_gateway(&self, gateway: Incarnation) {
         let suspected = self
             .shared
-            .peer_records
+            .verification
             .lock()
             .suspect(Instant::now(), gateway);
         if suspected {
@@ -206,7 +206,7 @@ impl MdnsDirectory {
     /// Removes all entries of this gateway at once, because it ended without a goodbye and another
     /// one took its place.
     pub fn gateway_has_ended(&self, gateway: Incarnation) {
-        self.shared.peer_records.lock().end(gateway);
+        self.shared.verification.lock().end(gateway);
         self.shared.postponed.notify_one();
     }
 
@@ -303,7 +303,7 @@ struct Shared {
     /// Entries of other gateways, by the full name of their record with its original spelling.
     table: Table<Arc<str>>,
     /// The records in `table`, by the gateway that announces them.
-    peer_records: Mutex<PeerRecords>,
+    verification: Mutex<Verification>,
     /// Records that are not in the table yet.
     coalition_sync: Mutex<CoalitionSync>,
     /// Whether to send a beacon at once because coalitions changed.
@@ -678,7 +678,7 @@ impl Shared {
     /// Stores the current state of a record, or its removal.
     fn put(&self, fullname: &Arc<str>, entry: Option<Arc<Entry>>) {
         let now = Instant::now();
-        self.peer_records
+        self.verification
             .lock()
             .put(now, fullname, entry.as_deref());
         self.show(|coalition_sync| coalition_sync.put(now, fullname, entry));

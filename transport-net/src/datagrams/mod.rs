@@ -4,7 +4,7 @@
 //!   [`socket`]s.
 //! * [`connections`]: the connections of an endpoint, and the order in which they act.
 //! * [`cookie`]: the address validation of unproved peers. [`dialing`]: the handshake of the
-//!   dialing side.
+//!   dialing side. [`shares`]: the part of each address in the connections and the memory.
 //!
 //! The protocols themselves are in [`crate::udp`] and `crate::legacy::udt`.
 
@@ -14,6 +14,7 @@ pub(crate) mod dialing;
 pub(crate) mod endpoint;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
+pub(crate) mod shares;
 pub(crate) mod socket;
 
 use std::collections::HashSet;

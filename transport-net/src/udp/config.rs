@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use super::packet::{BASE, LARGEST};
 use crate::Identity;
-use crate::rate_limit::{Rates, is_one_peer};
+use crate::datagrams::shares;
+use crate::rate_limit::Rates;
 use crate::stream::budget::BudgetLimits;
 
 /// Configuration of a [`UdpTransport`](crate::UdpTransport).
@@ -68,27 +69,15 @@ impl UdpLimits {
     /// Size of the largest possible datagram: 65,487 bytes.
     pub const LARGEST: usize = LARGEST;
 
-    /// Returns the maximum number of connections that the peers at this address may open: at most
-    /// half of all, for one address as for all loopback addresses together.
+    /// Returns the maximum number of connections that the peers at this address may open.
     pub(super) fn max_connections_of(&self, home: IpAddr) -> usize {
-        let half = (self.max_connections / 2).max(1);
-        match is_one_peer(home) {
-            true => self.max_per_address.min(half),
-            false => half,
-        }
+        shares::connections_of(home, self.max_connections, self.max_per_address)
     }
 
     /// Returns the memory limits of parcels that wait for earlier ones, for the peers at this
     /// address and for all.
     pub(super) fn budget_of(&self, home: IpAddr) -> BudgetLimits {
-        let each = self.max_incoming_per_source;
-        BudgetLimits {
-            total: self.max_incoming,
-            each: match is_one_peer(home) {
-                true => each,
-                false => each.saturating_mul(2),
-            },
-        }
+        shares::budget_of(home, self.max_incoming, self.max_incoming_per_source)
     }
 
     pub(super) fn rates(&self) -> Rates {

@@ -8,9 +8,9 @@ use fipa_transport::{
     Report, Signature, TransportError, TransportErrorKind,
 };
 
-use super::super::attempts::AttemptTable;
 use super::super::ids::registration_of;
 use super::super::label::HandedOver;
+use super::super::lane_table::LaneTable;
 use super::super::origin::Settlement;
 use super::super::rules::{self, AttemptEnd, Belief, Cause, CustodyReport};
 use super::super::tally::Tally;
@@ -26,7 +26,7 @@ impl Lane {
         sequence: u64,
         attempt: AttemptId,
         conclusion: Conclusion,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         let Some(index) = self.index(sequence) else {
             return;
@@ -97,7 +97,7 @@ impl Lane {
         index: usize,
         (attempt, location): (AttemptId, Location),
         answer: Answer,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         // The route had room.
         self.congested = 0;
@@ -157,7 +157,7 @@ impl Lane {
     }
 
     /// Handles an answer that this registration of the receiver recently left its host.
-    fn receiver_moved(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
+    fn receiver_moved(&mut self, now: Instant, index: usize, table: &mut LaneTable) {
         let open_letter = &self.letters[index];
         let registration = open_letter.registration;
         if self.is_custody() {
@@ -183,7 +183,7 @@ impl Lane {
         now: Instant,
         index: usize,
         refused: Option<(Location, String)>,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         self.again(now, index, Cause::NoSuchAgent, table);
         self.await_directory(index, Departure::Unknown { refused }, table);
@@ -191,13 +191,13 @@ impl Lane {
 
     /// Makes a letter whose registration another service reports as moved or unknown wait for a refresh of
     /// the directory.
-    fn await_directory(&mut self, index: usize, departure: Departure, table: &mut AttemptTable) {
+    fn await_directory(&mut self, index: usize, departure: Departure, table: &mut LaneTable) {
         self.letters[index].progress.departure = Some(Box::new(departure));
         self.want_refresh(table);
     }
 
     /// Handles the end of a refresh of the directory.
-    pub(crate) fn refreshed(&mut self, now: Instant, number: u64, table: &mut AttemptTable) {
+    pub(crate) fn refreshed(&mut self, now: Instant, number: u64, table: &mut LaneTable) {
         // A later refresh may have been requested.
         if self.awaited.is_none_or(|awaited| awaited > number) {
             return;
@@ -240,7 +240,7 @@ impl Lane {
     /// Handles a letter whose receiver is in the directory, but not known to its service. The directory
     /// may show an agent that has left, and not yet show its successor; or the service may not yet know
     /// an agent that has come. The sender's process sends the letter again for a while.
-    fn contradicted(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
+    fn contradicted(&mut self, now: Instant, index: usize, table: &mut LaneTable) {
         let is_custody = self.is_custody();
         let registration = self.letters[index].registration;
         let progress = &mut self.letters[index].progress;
@@ -269,7 +269,7 @@ impl Lane {
         index: usize,
         location: &Location,
         (reason, detail): (FailureReason, String),
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         let fault = TransportErrorKind::Refused;
         self.letters[index].failed_at(location, TransportError { fault, detail });
@@ -283,7 +283,7 @@ impl Lane {
         index: usize,
         location: &Location,
         (error, cause): (TransportError, Cause),
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         if let Some(tally) = self.tally() {
             tally.fail(now, &error);
@@ -317,7 +317,7 @@ impl Lane {
         from: &Hop,
         letter: HandedOver,
         report: Report,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         let HandedOver {
             registration,
@@ -383,7 +383,7 @@ impl Lane {
 
     /// Takes a letter back after a report, which may have arrived before the conclusion of the
     /// attempt.
-    fn end_hand_over(&mut self, index: usize, transfer: u64, table: &mut AttemptTable) {
+    fn end_hand_over(&mut self, index: usize, transfer: u64, table: &mut LaneTable) {
         let state = &mut self.letters[index].progress.state;
         let before = std::mem::replace(state, State::Ended);
         if let State::UnderWay {
@@ -408,7 +408,7 @@ impl Lane {
         index: usize,
         taken_by: Option<Kind>,
         outcome: Outcome,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         // The sender is told the transport between the hosts, which only this side may know.
         let route = |theirs| match taken_by {
@@ -445,7 +445,7 @@ impl Lane {
     }
 
     /// Handles a change of the directory: services with letters in custody may be gone.
-    pub(crate) fn directory_changed(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(crate) fn directory_changed(&mut self, now: Instant, table: &mut LaneTable) {
         self.check_next_hops(now, table);
         self.notice_end(now, table);
         self.dispatch_all(now, table);
@@ -453,7 +453,7 @@ impl Lane {
 
     /// Ends attempts and custody at services that no longer lead to the receiver, according to the
     /// receiver's entry in the directory.
-    pub(super) fn check_next_hops(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(super) fn check_next_hops(&mut self, now: Instant, table: &mut LaneTable) {
         let mut entry: Option<(Incarnation, Option<std::sync::Arc<Entry>>)> = None;
         for index in 0..self.letters.len() {
             let registration = self.letters[index].registration;
@@ -477,7 +477,7 @@ impl Lane {
     /// Detects that a registration with letters in the lane has left the directory; letters for its
     /// successor then wait only for a limited time. Letters before the first one for that
     /// registration may have moved to the successor.
-    pub(super) fn notice_end(&mut self, now: Instant, table: &AttemptTable) {
+    pub(super) fn notice_end(&mut self, now: Instant, table: &LaneTable) {
         if self.is_custody() || self.stated.is_some() {
             return;
         }
@@ -514,13 +514,7 @@ impl Lane {
 
     /// Checks whether the receiver can still be reached through the service that the letter was
     /// handed to; if not, ends the wait for that service's answer or report.
-    fn check_next_hop(
-        &mut self,
-        now: Instant,
-        index: usize,
-        entry: &Entry,
-        table: &mut AttemptTable,
-    ) {
+    fn check_next_hop(&mut self, now: Instant, index: usize, entry: &Entry, table: &mut LaneTable) {
         let open_letter = &mut self.letters[index];
         let Some((_, location)) = open_letter.progress.state.handed_over() else {
             return;
@@ -534,21 +528,15 @@ impl Lane {
         if !service.is_known() || (is_there && !(is_under_way && has_left())) {
             return;
         }
-        match &mut open_letter.progress.state {
-            State::UnderWay {
-                attempt,
-                location,
-                abandoned,
-                ..
-            } => {
-                if !std::mem::replace(abandoned, true) {
-                    let text = match is_there {
-                        true => "the service has left this location",
-                        false => "the service at this location was replaced",
-                    };
-                    let error = TransportError::new(TransportErrorKind::Broken, text);
-                    table.abandon(location.clone(), *attempt, error);
-                }
+        match &open_letter.progress.state {
+            State::UnderWay { .. } => {
+                let text = match is_there {
+                    true => "the service has left this location",
+                    false => "the service at this location was replaced",
+                };
+                open_letter.abandon(table, || {
+                    TransportError::new(TransportErrorKind::Broken, text)
+                });
             }
             State::Custody { .. } => {
                 let text = "the gateway that had the letter in custody is gone";

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use fipa_transport::{FailureReason, TransportError, TransportErrorKind};
 
-use super::super::attempts::AttemptTable;
+use super::super::lane_table::LaneTable;
 use super::super::work;
 use super::open_letter::{Holding, State};
 use super::{ENDED_AT_ONCE, ENDED_TIMEOUT, Lane};
@@ -14,7 +14,7 @@ impl Lane {
     /// return. Returns false if more letters end than one visit handles; the lane is due at once then, and
     /// nothing may be dispatched.
     #[must_use]
-    pub(super) fn expire(&mut self, now: Instant, table: &mut AttemptTable) -> bool {
+    pub(super) fn expire(&mut self, now: Instant, table: &mut LaneTable) -> bool {
         if self.due.is_none_or(|due| due > now) {
             return true;
         }
@@ -40,22 +40,15 @@ impl Lane {
                 answered += 1;
             }
             match &mut open_letter.progress.state {
-                State::UnderWay {
-                    attempt,
-                    location,
-                    times_out,
-                    abandoned: asked,
-                } => {
-                    let ends = expired || abandoned || *times_out <= now;
-                    if ends && !std::mem::replace(asked, true) {
-                        let error = match expired {
-                            true => TransportError::new(
-                                TransportErrorKind::TimedOut,
-                                "the letter's deadline passed",
-                            ),
-                            false => TransportError::new(TransportErrorKind::TimedOut, ""),
+                State::UnderWay { times_out, .. } => {
+                    if expired || abandoned || *times_out <= now {
+                        let text = match expired {
+                            true => "the letter's deadline passed",
+                            false => "",
                         };
-                        table.abandon(location.clone(), *attempt, error);
+                        open_letter.abandon(table, || {
+                            TransportError::new(TransportErrorKind::TimedOut, text)
+                        });
                     }
                 }
                 State::Custody { location, .. } if expired || abandoned => {

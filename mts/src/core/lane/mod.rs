@@ -40,9 +40,9 @@ use self::open_letter::State;
 use self::pause::Pause;
 pub(crate) use self::pause::PauseEnd;
 use self::predecessors::PastLetters;
-use super::attempts::{AttemptTable, Purpose};
 use super::ids::{LaneId, LaneKey, registration_of};
 use super::label::PredecessorNote;
+use super::lane_table::{LaneTable, Purpose};
 use super::origin::{Origin, Settlement};
 use super::rules;
 use super::tally::Tally;
@@ -136,7 +136,7 @@ pub(crate) struct Lane {
     /// Time at which custodians are asked whether they have letters of this lane.
     ask_custodian: Option<Instant>,
     /// Whether a letter may wait for its predecessor to arrive.
-    holds: bool,
+    has_held_letters: bool,
     past_letters: PastLetters,
     /// Earliest time at which a timer of this lane is due.
     due: Option<Instant>,
@@ -185,7 +185,7 @@ impl Lane {
             is_abroad: false,
             ended: None,
             ask_custodian: None,
-            holds: false,
+            has_held_letters: false,
             past_letters: PastLetters::default(),
             due: None,
             scheduled: None,
@@ -242,7 +242,7 @@ impl Lane {
     }
 
     /// Whether there is room for another letter of this process with this many bytes.
-    pub(crate) fn has_room(&self, len: usize, table: &AttemptTable) -> bool {
+    pub(crate) fn has_room(&self, len: usize, table: &LaneTable) -> bool {
         let config = &table.config;
         let fits = self.bytes.saturating_add(len) <= config.lane_bytes;
         self.letters.len() < config.lane && (fits || self.letters.is_empty())
@@ -250,7 +250,7 @@ impl Lane {
 
     /// Whether there is room for another letter of a legacy peer with this many bytes. Such a peer cannot be held
     /// back, and a letter that is refused is lost for it, so bytes are the limit.
-    pub(crate) fn has_room_for_legacy(&self, len: usize, table: &AttemptTable) -> bool {
+    pub(crate) fn has_room_for_legacy(&self, len: usize, table: &LaneTable) -> bool {
         let config = &table.config;
         let fits = self.bytes.saturating_add(len) <= config.lane_bytes;
         let is_long = self.letters.len() >= config.lane.saturating_mul(OF_LEGACY_PEERS);
@@ -259,7 +259,7 @@ impl Lane {
 
     /// Whether another letter of this process with this many bytes can wait in the lane. While letters leave the
     /// lane, more of them wait than otherwise.
-    pub(crate) fn holds_back(&self, now: Instant, len: usize, table: &AttemptTable) -> bool {
+    pub(crate) fn has_room_to_wait(&self, now: Instant, len: usize, table: &LaneTable) -> bool {
         let config = &table.config;
         self.has_room(len, table)
             || (self.letters.len() < config.lane.saturating_mul(HELD_BACK)
@@ -268,7 +268,7 @@ impl Lane {
     }
 
     /// Whether the letters in custody leave room for another one with this many bytes in this lane.
-    pub(crate) fn fits_into_custody(&self, len: usize, table: &AttemptTable) -> bool {
+    pub(crate) fn fits_into_custody(&self, len: usize, table: &LaneTable) -> bool {
         table
             .custody
             .has_room(&self.receiver, self.counted(len), &table.config)
@@ -286,12 +286,7 @@ impl Lane {
 
     /// Whether a custodian takes this letter. A letter below a waiting one is taken beyond the
     /// limits, up to twice as much.
-    pub(crate) fn takes_into_custody(
-        &self,
-        sequence: u64,
-        len: usize,
-        table: &AttemptTable,
-    ) -> bool {
+    pub(crate) fn takes_into_custody(&self, sequence: u64, len: usize, table: &LaneTable) -> bool {
         let config = &table.config;
         let held = table.custody.held().saturating_add(len.max(LETTER_BYTES));
         if self.has_room(len, table) && self.fits_into_custody(len, table) {
@@ -307,7 +302,7 @@ impl Lane {
     /// Whether letters wait for a pause to end, and the receiver has such a location.
     pub(crate) fn is_paused_towards(
         &self,
-        table: &AttemptTable,
+        table: &LaneTable,
         is_meant: impl Fn(&Location) -> bool,
     ) -> bool {
         let first = self.letters.front().filter(|_| self.pause.is_some());
@@ -328,7 +323,7 @@ impl Lane {
 
     /// The entry of this registration of the receiver: from the directory, or as the receiver
     /// stated it. `None` when it has moved.
-    fn entry(&self, registration: Incarnation, table: &AttemptTable) -> Option<Arc<Entry>> {
+    fn entry(&self, registration: Incarnation, table: &LaneTable) -> Option<Arc<Entry>> {
         if self.moving.is_some_and(|(moved, _)| moved == registration) {
             return None;
         }
@@ -342,7 +337,7 @@ impl Lane {
     }
 
     /// Inserts a letter at its position in the order.
-    pub(crate) fn push(&mut self, mut open_letter: Box<OpenLetter>, table: &mut AttemptTable) {
+    pub(crate) fn push(&mut self, mut open_letter: Box<OpenLetter>, table: &mut LaneTable) {
         open_letter.position = self.pushed;
         self.pushed += 1;
         let len = open_letter.letter.len();
@@ -373,7 +368,7 @@ impl Lane {
     }
 
     /// Dispatches all letters that can be dispatched.
-    pub(crate) fn dispatch_all(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(crate) fn dispatch_all(&mut self, now: Instant, table: &mut LaneTable) {
         self.active = now;
         if !self.expire(now, table) {
             return;
@@ -389,7 +384,7 @@ impl Lane {
         self.give_credit(table);
     }
 
-    fn dispatch_waiting(&mut self, now: Instant, table: &mut AttemptTable) {
+    fn dispatch_waiting(&mut self, now: Instant, table: &mut LaneTable) {
         let (mut index, mut failed) = (0, 0);
         while index < self.letters.len() && self.under_way < table.config.window {
             work::steps(1);
@@ -456,7 +451,7 @@ impl Lane {
 
     /// Whether the receiver still remembers the first open letter after it has taken the letter at this
     /// index. Custodians hold what the sender's process has dispatched.
-    fn is_remembered(&self, index: usize, table: &AttemptTable) -> bool {
+    fn is_remembered(&self, index: usize, table: &LaneTable) -> bool {
         let (first, letter) = (self.letters.front(), self.letters.get(index));
         let (Some(first), Some(letter)) = (first, letter) else {
             return true;
@@ -478,7 +473,7 @@ impl Lane {
         now: Instant,
         index: usize,
         (route, local): (Location, bool),
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         let after = self.after(index);
         let progress = &mut self.letters[index].progress;
@@ -538,7 +533,7 @@ impl Lane {
     }
 
     /// The counters of the current route, looked up only when the route changes.
-    fn tally_of(&mut self, route: &Location, table: &mut AttemptTable) -> Option<&Tally> {
+    fn tally_of(&mut self, route: &Location, table: &mut LaneTable) -> Option<&Tally> {
         if self
             .tally
             .as_ref()
@@ -567,7 +562,7 @@ impl Lane {
         now: Instant,
         index: usize,
         entry: &Entry,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) -> bool {
         let open_letter = &mut self.letters[index];
         if open_letter.progress.tried.is_empty() {
@@ -613,7 +608,7 @@ impl Lane {
         now: Instant,
         index: usize,
         reach: Reach,
-        table: &AttemptTable,
+        table: &LaneTable,
     ) -> Option<FailureReason> {
         let open_letter = &mut self.letters[index];
         let reason = open_letter.unfit()?;
@@ -631,13 +626,13 @@ impl Lane {
     }
 
     /// Requests a refresh of the directory. The letters of the lane wait for it.
-    pub(super) fn want_refresh(&mut self, table: &mut AttemptTable) {
+    pub(super) fn want_refresh(&mut self, table: &mut LaneTable) {
         self.awaited = Some(table.want_refresh_for(self.id));
     }
 
     /// Handles the end of the registration that the letter is for, after a refresh. Returns whether the lane may
     /// continue with the letter at this index: another one, or the same for the new registration.
-    fn receiver_left(&mut self, now: Instant, index: usize, table: &mut AttemptTable) -> bool {
+    fn receiver_left(&mut self, now: Instant, index: usize, table: &mut LaneTable) -> bool {
         let open_letter = &self.letters[index];
         let registration = open_letter.registration;
         if !rules::may_move(open_letter.progress.uncertain) {
@@ -680,7 +675,7 @@ impl Lane {
     /// Whether a letter that may have arrived waits for its receiver to return to the directory. After a broken
     /// connection, the directory may have less than before: the receiver was known from its letters only, for
     /// example. A registration that has a successor does not return, and neither does one of this host.
-    fn may_return(&mut self, now: Instant, index: usize, table: &AttemptTable) -> bool {
+    fn may_return(&mut self, now: Instant, index: usize, table: &LaneTable) -> bool {
         let registration = self.letters[index].registration;
         let has_successor = table.view.named(&self.receiver).is_some();
         if !self.is_abroad || has_successor || table.departed.contains(now, registration) {
@@ -699,7 +694,7 @@ impl Lane {
     /// transit gets its outcome from the conclusion of its transport, which follows at once. Letters
     /// in custody are returned to the services that handed them over, which try other routes, or
     /// give the outcome.
-    pub(crate) fn give_up(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(crate) fn give_up(&mut self, now: Instant, table: &mut LaneTable) {
         self.recovering = true;
         self.returning = self.is_custody();
         work::steps(self.letters.len());
@@ -709,17 +704,10 @@ impl Lane {
                 open_letter.deadline = now;
             }
             match &mut open_letter.progress.state {
-                State::UnderWay {
-                    attempt,
-                    location,
-                    abandoned,
-                    ..
-                } => {
-                    if !std::mem::replace(abandoned, true) {
-                        let error =
-                            TransportError::new(TransportErrorKind::Closed, "the sender went away");
-                        table.abandon(location.clone(), *attempt, error);
-                    }
+                State::UnderWay { .. } => {
+                    open_letter.abandon(table, || {
+                        TransportError::new(TransportErrorKind::Closed, "the sender went away")
+                    });
                     index += 1;
                 }
                 State::Custody { .. } if self.returning => {
@@ -744,13 +732,7 @@ impl Lane {
     }
 
     /// Ends a letter as failed, or as unconfirmed if an attempt may have delivered it.
-    fn fail(
-        &mut self,
-        now: Instant,
-        index: usize,
-        reason: FailureReason,
-        table: &mut AttemptTable,
-    ) {
+    fn fail(&mut self, now: Instant, index: usize, reason: FailureReason, table: &mut LaneTable) {
         let open_letter = &mut self.letters[index];
         let reason = match open_letter.progress.uncertain {
             true => FailureReason::Unconfirmed,
@@ -780,7 +762,7 @@ impl Lane {
     }
 
     /// Fails a letter to an agent that the directory no longer lists.
-    fn fail_absent(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
+    fn fail_absent(&mut self, now: Instant, index: usize, table: &mut LaneTable) {
         let (reason, attempt) = table.absence(&self.receiver);
         if let Some(Attempt {
             location, error, ..
@@ -797,7 +779,7 @@ impl Lane {
         now: Instant,
         index: usize,
         settlement: Settlement,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         let Some(open_letter) = self.letters.remove(index) else {
             return;
@@ -843,7 +825,7 @@ impl Lane {
 
     /// Sends the custodian of the letter at `index` its new predecessor, after the letter before it
     /// failed at the sender's process. A gateway may hold a letter before it answers.
-    fn send_predecessor(&mut self, index: usize, table: &mut AttemptTable) {
+    fn send_predecessor(&mut self, index: usize, table: &mut LaneTable) {
         let Some(open_letter) = self.letters.get(index) else {
             return;
         };
@@ -869,7 +851,7 @@ impl Lane {
         }
     }
 
-    fn give_credit(&mut self, table: &mut AttemptTable) {
+    fn give_credit(&mut self, table: &mut LaneTable) {
         let config = &table.config;
         if self.letters.len() * 2 <= config.lane
             && self.bytes <= config.lane_bytes / 2

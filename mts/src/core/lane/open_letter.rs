@@ -10,7 +10,7 @@ use fipa_transport::{
 use smallvec::SmallVec;
 
 use super::super::action::Action;
-use super::super::attempts::AttemptTable;
+use super::super::lane_table::LaneTable;
 use super::super::origin::{Origin, Upstream};
 use super::super::rules::{self, AttemptEnd};
 use super::turns::{HandOvers, Pace, Turn};
@@ -194,6 +194,25 @@ impl OpenLetter {
         }
     }
 
+    /// Has the transport end the attempt under way, if there is one and it was not asked before. The conclusion
+    /// follows at once.
+    pub(super) fn abandon(
+        &mut self,
+        table: &mut LaneTable,
+        error: impl FnOnce() -> TransportError,
+    ) {
+        if let State::UnderWay {
+            attempt,
+            location,
+            abandoned,
+            ..
+        } = &mut self.progress.state
+            && !std::mem::replace(abandoned, true)
+        {
+            table.abandon(location.clone(), *attempt, error());
+        }
+    }
+
     /// Records the end of an attempt or a custody.
     pub(super) fn ended(&mut self, end: AttemptEnd) {
         self.progress.uncertain = rules::stays_uncertain(self.progress.uncertain, end);
@@ -290,7 +309,7 @@ impl OpenLetter {
     }
 
     /// Answers the services that wait for an answer that the letter is in custody.
-    pub(super) fn custody_taken(&mut self, table: &mut AttemptTable) {
+    pub(super) fn custody_taken(&mut self, table: &mut LaneTable) {
         if let Origin::Forwarded { upstreams } = &mut self.origin {
             for upstream in upstreams {
                 if let Some((kind, ticket)) = upstream.unanswered.take() {

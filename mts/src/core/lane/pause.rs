@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::Hop;
 
-use super::super::attempts::AttemptTable;
+use super::super::lane_table::LaneTable;
 use super::super::rules::{self, Again, Cause};
 use super::Lane;
 use super::open_letter::{State, is_of};
@@ -51,7 +51,7 @@ impl Lane {
         now: Instant,
         index: usize,
         cause: Cause,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         self.recovering = true;
         let after = self.after(index);
@@ -137,7 +137,7 @@ impl Lane {
     }
 
     /// Continues after an event that may have ended the pause.
-    pub(crate) fn resume(&mut self, now: Instant, event: PauseEnd, table: &mut AttemptTable) {
+    pub(crate) fn resume(&mut self, now: Instant, event: PauseEnd, table: &mut LaneTable) {
         if self.end_pause(event) {
             self.dispatch_all(now, table);
         }
@@ -145,7 +145,7 @@ impl Lane {
 
     /// Handles a credit: the service that answered that it was full has room again. Credits of
     /// others do not count, because each one has a letter dispatched again.
-    pub(crate) fn credited(&mut self, now: Instant, from: &Hop, table: &mut AttemptTable) {
+    pub(crate) fn credited(&mut self, now: Instant, from: &Hop, table: &mut LaneTable) {
         let counts = self.busy_at.is_some_and(|busy| is_of(busy, from))
             && rules::credit_counts(self.has_settled);
         if counts && self.end_pause(PauseEnd::Credit) {

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{Answer, Hop, TransportError, TransportErrorKind};
 
-use super::super::attempts::AttemptTable;
 use super::super::label::{HandedOver, Label, PredecessorNote};
+use super::super::lane_table::LaneTable;
 use super::super::origin::{Settlement, Upstream};
 use super::super::rules::{self, AttemptEnd, Cause, HoldDecision};
 use super::super::work;
@@ -43,7 +43,7 @@ impl Lane {
         now: Instant,
         label: &Label,
         upstream: Upstream,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) -> Result<(), Upstream> {
         let Some(index) = self.index(label.sequence) else {
             return Err(upstream);
@@ -64,7 +64,7 @@ impl Lane {
         now: Instant,
         from: &Hop,
         note: PredecessorNote,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) -> Option<Answer> {
         let index = self.index(note.sequence);
         let index = index.filter(|index| self.letters[*index].came_from(from, note.transfer))?;
@@ -77,7 +77,7 @@ impl Lane {
     }
 
     /// Maximum time for the predecessor of the letter at `index` to arrive.
-    pub(super) fn predecessor_timeout(&self, index: usize, table: &AttemptTable) -> Duration {
+    pub(super) fn predecessor_timeout(&self, index: usize, table: &LaneTable) -> Duration {
         let upstreams = self.letters[index].upstreams();
         let slowest = upstreams.filter_map(|it| table.round_trip(it)).max();
         (slowest.unwrap_or_default() * 2).clamp(LEAST_TIMEOUT, MOST_TIMEOUT)
@@ -93,7 +93,7 @@ impl Lane {
 
     /// Asks the custodians of the letters that are longest in custody whether they have them, and
     /// sends them the current predecessors with that. Checks the directory's data about them, too.
-    pub(super) fn ask_custodians(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(super) fn ask_custodians(&mut self, now: Instant, table: &mut LaneTable) {
         if self.ask_custodian.is_none_or(|due| due > now) {
             return;
         }
@@ -145,7 +145,7 @@ impl Lane {
         &mut self,
         now: Instant,
         letter: HandedOver,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         if let Some(index) = self.in_custody(letter) {
             let text = "the gateway that had the letter in custody does not have it";
@@ -180,7 +180,7 @@ impl Lane {
         now: Instant,
         index: usize,
         text: &'static str,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         let open_letter = &mut self.letters[index];
         if let State::Custody { location, .. } = &open_letter.progress.state {
@@ -191,7 +191,7 @@ impl Lane {
         }
     }
 
-    fn lower_predecessor(&mut self, index: usize, after: u64, table: &mut AttemptTable) {
+    fn lower_predecessor(&mut self, index: usize, after: u64, table: &mut LaneTable) {
         let stream = self.stream_of(&self.letters[index]);
         let open_letter = &mut self.letters[index];
         let lower = rules::lower(open_letter.after, after);
@@ -248,7 +248,7 @@ impl Lane {
         now: Instant,
         index: usize,
         timeout: Duration,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         let open_letter = &self.letters[index];
         let after = open_letter.after;
@@ -264,7 +264,7 @@ impl Lane {
             }
             HoldDecision::For(rest) => {
                 let until = now + rest;
-                self.holds = true;
+                self.has_held_letters = true;
                 self.letters[index].progress.hold = Some(Holding::Until(until));
                 self.due_at(until);
             }
@@ -273,7 +273,7 @@ impl Lane {
     }
 
     /// Returns a letter to the services that handed it over.
-    pub(super) fn return_letter(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
+    pub(super) fn return_letter(&mut self, now: Instant, index: usize, table: &mut LaneTable) {
         let open_letter = &self.letters[index];
         let (sequence, uncertain) = (open_letter.sequence, open_letter.progress.uncertain);
         self.settle(now, index, Settlement::Returned { uncertain }, table);
@@ -284,23 +284,23 @@ impl Lane {
             && next.after >= sequence
         {
             next.progress.hold = Some(Holding::Until(now));
-            self.holds = true;
+            self.has_held_letters = true;
             self.due_at(now);
         }
     }
 
     /// Lets letters that wait for the arrival of this one wait for it in the lane.
     pub(super) fn predecessor_came(&mut self, sequence: u64) {
-        if !self.holds {
+        if !self.has_held_letters {
             return;
         }
-        self.holds = false;
+        self.has_held_letters = false;
         work::steps(self.letters.len());
         for open_letter in &mut self.letters {
             if open_letter.after == sequence {
                 open_letter.progress.hold = None;
             }
-            self.holds |= matches!(open_letter.progress.hold, Some(Holding::Until(_)));
+            self.has_held_letters |= matches!(open_letter.progress.hold, Some(Holding::Until(_)));
         }
     }
 }

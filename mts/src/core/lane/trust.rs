@@ -6,7 +6,7 @@ use std::time::Instant;
 use fipa_sds::{Entry, Reach};
 use fipa_transport::{FailureReason, TransportError, TransportErrorKind};
 
-use super::super::attempts::AttemptTable;
+use super::super::lane_table::LaneTable;
 use super::super::rules::AttemptEnd;
 use super::super::work;
 use super::Lane;
@@ -14,7 +14,7 @@ use super::open_letter::State;
 
 impl Lane {
     /// Handles a change of the services whose certificate is no longer trusted.
-    pub(crate) fn trust_changed(&mut self, now: Instant, table: &mut AttemptTable) {
+    pub(crate) fn trust_changed(&mut self, now: Instant, table: &mut LaneTable) {
         work::steps(self.letters.len());
         let mut index = 0;
         while let Some(open_letter) = self.letters.get(index) {
@@ -26,15 +26,8 @@ impl Lane {
             };
             match &mut open_letter.progress.state {
                 // Its conclusion follows at once, and then it is refused like one that waits.
-                State::UnderWay {
-                    attempt,
-                    location,
-                    abandoned,
-                    ..
-                } => {
-                    if !std::mem::replace(abandoned, true) {
-                        table.abandon(location.clone(), *attempt, error(&entry));
-                    }
+                State::UnderWay { .. } => {
+                    open_letter.abandon(table, || error(&entry));
                     index += 1;
                 }
                 State::Custody { .. } => {
@@ -53,7 +46,7 @@ impl Lane {
         now: Instant,
         index: usize,
         entry: &Entry,
-        table: &mut AttemptTable,
+        table: &mut LaneTable,
     ) {
         if let Some(location) = entry.locations.first() {
             self.letters[index].failed_at(location, error(entry));
@@ -63,7 +56,7 @@ impl Lane {
 }
 
 /// Whether the service of this agent has a certificate that is no longer trusted.
-pub(super) fn is_withdrawn(entry: &Entry, table: &AttemptTable) -> bool {
+pub(super) fn is_withdrawn(entry: &Entry, table: &LaneTable) -> bool {
     match entry.reach {
         Reach::Remote { gateway } => table.withdrawn.contains_key(&gateway),
         Reach::Local => false,

@@ -7,15 +7,15 @@ use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, Location, Stream, TransportError, TransportErrorKind,
 };
 
-use super::super::attempts::{AttemptTable, Purpose};
 use super::super::ids::LaneId;
 use super::super::label::HandedOver;
 use super::super::lane::PauseEnd;
+use super::super::lane_table::{LaneTable, Purpose};
 use super::super::{Core, Now, work};
 use super::{AFTER_ANSWER, Due, Note, PROBES, ROOM_TRIES, TIMERS_AT_ONCE, Timer, source_of};
 use crate::gate::LetterSource;
 
-impl AttemptTable {
+impl LaneTable {
     /// Sends a note.
     pub(crate) fn note(&mut self, mut note: Note) {
         if note.is_report() {

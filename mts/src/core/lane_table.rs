@@ -1,4 +1,5 @@
-//! The state that all lanes share: the actions for the runtime, the attempts in progress, and the parts below them.
+//! The state that all lanes share: the actions for the runtime, the attempts in progress, the choice of a route by
+//! the configured order, and the parts below them.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -35,7 +36,7 @@ pub(crate) enum Purpose {
 }
 
 /// State that all lanes share.
-pub(crate) struct AttemptTable {
+pub(crate) struct LaneTable {
     pub(crate) config: CoreConfig,
     pub(crate) view: Arc<dyn View>,
     pub(crate) actions: VecDeque<Action>,
@@ -62,7 +63,7 @@ pub(crate) struct AttemptTable {
 /// Maximum number of services whose round trips are remembered.
 const MAX_ROUND_TRIPS: usize = 4096;
 
-impl AttemptTable {
+impl LaneTable {
     pub(crate) fn new(config: CoreConfig, view: Arc<dyn View>) -> Self {
         Self {
             config,

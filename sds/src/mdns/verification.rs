@@ -1,4 +1,5 @@
-//! Stored records by gateway, and the queue of those to verify.
+//! The records of peers that are verified, and their times: by a doubt about their gateway, by a beacon that
+//! contradicts them, and for legacy peers one by one. Knows the stored records by gateway.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
@@ -22,7 +23,7 @@ const AGAIN: Duration = Duration::from_secs(1);
 
 /// Records of other hosts by gateway, and the queue of those to verify.
 #[derive(Debug, Default)]
-pub(super) struct PeerRecords {
+pub(super) struct Verification {
     records: HashMap<Arc<str>, (Incarnation, Digest)>,
     gateways: HashMap<Incarnation, Gateway>,
     queue: VecDeque<Arc<str>>,
@@ -43,7 +44,7 @@ struct Gateway {
     verified: HashSet<Arc<str>>,
 }
 
-impl PeerRecords {
+impl Verification {
     /// Stores the record with this full name, or removes it if `entry` is `None`.
     pub(super) fn put(&mut self, now: Instant, fullname: &Arc<str>, entry: Option<&Entry>) {
         if let Some((gateway, digest)) = self.records.remove(fullname)
@@ -220,7 +221,7 @@ mod tests {
         }
     }
 
-    fn put(holdings: &mut PeerRecords, now: Instant, number: u64, gateway: u64, there: bool) {
+    fn put(holdings: &mut Verification, now: Instant, number: u64, gateway: u64, there: bool) {
         let entry = entry(number, gateway);
         let entry = there.then_some(&entry);
         holdings.put(now, &number.to_string().into(), entry);
@@ -228,7 +229,7 @@ mod tests {
 
     #[test]
     fn the_digest_of_a_gateway_follows_its_records() {
-        let mut holdings = PeerRecords::default();
+        let mut holdings = Verification::default();
         let now = Instant::now();
         for number in 1..=3 {
             put(&mut holdings, now, number, 7, true);
@@ -254,7 +255,7 @@ mod tests {
 
     #[test]
     fn the_end_of_a_doubted_record_verifies_all_records_of_its_gateway() {
-        let mut holdings = PeerRecords::default();
+        let mut holdings = Verification::default();
         let (now, gateway) = (Instant::now(), Incarnation::from_u64(7));
         for number in 0..60 {
             put(&mut holdings, now, number, 7, true);
@@ -297,7 +298,7 @@ mod tests {
 
     #[test]
     fn a_gateway_whose_records_change_is_doubted_again_after_a_second() {
-        let mut holdings = PeerRecords::default();
+        let mut holdings = Verification::default();
         let (start, gateway) = (Instant::now(), Incarnation::from_u64(7));
         put(&mut holdings, start, 1, 7, true);
         assert!(holdings.suspect(start, gateway));
@@ -312,7 +313,7 @@ mod tests {
 
     #[test]
     fn gateways_that_are_doubted_often_take_bounded_memory() {
-        let mut holdings = PeerRecords::default();
+        let mut holdings = Verification::default();
         let start = Instant::now();
         for number in 0..250 {
             put(&mut holdings, start, number, 1 + number % 10, true);
