@@ -10,9 +10,9 @@ use std::sync::Arc;
 
 use fipa_content::{Parameter, Printer, Term};
 
-use crate::description::{ActionDescription, Policy};
-use crate::message::{Failure, Goal, GoalState, GoalStatus, Progress, Refusal};
-use crate::{MAX_NAME, RESERVED};
+use crate::description::{ActionDescription, Policy, short};
+use crate::message::{Failure, Goal, GoalRef, GoalState, GoalStatus, Progress, Refusal, length};
+use crate::{CANCEL, MAX_NAME, MAX_PROGRESS, RESERVED};
 
 /// Maximum number of conversations about one goal.
 const MAX_CONVERSATIONS: usize = 4;
@@ -116,7 +116,7 @@ pub enum OfferRefused {
     /// A name is empty, too long, reserved, or there twice.
     #[error(
         "the name {0:?} is empty, longer than {MAX_NAME} bytes, there twice, or one of goal, deadline \
-         and fence"
+         and fence, or cancel-goals"
     )]
     Name(String),
     /// The default of a parameter is no value of it.
@@ -130,6 +130,8 @@ pub enum OfferRefused {
 pub enum Cause {
     /// The client cancelled.
     Cancelled,
+    /// An operator cancelled.
+    CancelledByOperator,
     /// The client left or died.
     ClientGone,
     /// The deadline of the goal passed.
@@ -141,9 +143,13 @@ pub enum Cause {
 }
 
 impl Cause {
-    fn failure(self) -> Failure {
+    /// Returns the failure of a goal that `operator` has cancelled if an operator has.
+    fn failure(self, operator: Option<&str>) -> Failure {
         match self {
             Self::Cancelled => Failure::Cancelled,
+            Self::CancelledByOperator => {
+                Failure::CancelledBy(operator.unwrap_or_default().to_owned())
+            }
             Self::ClientGone => Failure::ClientGone,
             Self::DeadlinePassed => Failure::DeadlinePassed,
             Self::Preempted => Failure::Preempted,
@@ -269,6 +275,8 @@ struct Record {
     timers: Vec<(Timer, u64)>,
     progress: Option<Progress>,
     reported: Option<u64>,
+    /// The operator that has cancelled the goal.
+    operator: Option<Arc<str>>,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -301,7 +309,7 @@ impl Executor {
         options: OfferOptions,
     ) -> Result<(), OfferRefused> {
         let name = description.name.clone();
-        if name.is_empty() || name.len() > MAX_NAME {
+        if name.is_empty() || name.len() > MAX_NAME || name == CANCEL {
             return Err(OfferRefused::Name(name));
         }
         if self.offers.contains_key(&name) {
@@ -362,8 +370,7 @@ impl Executor {
         goal: Goal,
     ) -> Result<bool, Refusal> {
         let Some(offer) = self.offers.get_mut(&goal.action) else {
-            let name = crate::description::short(&goal.action);
-            return Err(Refusal::UnknownAction(name));
+            return Err(Refusal::UnknownAction(short(&goal.action)));
         };
         if id.is_empty() || id.len() > MAX_NAME {
             return Err(Refusal::Malformed("the goal id".to_owned()));
@@ -439,6 +446,7 @@ impl Executor {
             timers: Vec::new(),
             progress: None,
             reported: None,
+            operator: None,
         };
         self.goals.insert(number, record);
         self.ids.insert(key, number);
@@ -521,6 +529,19 @@ impl Executor {
         }
     }
 
+    /// Handles a cancel of a goal by its number, from its client or an operator.
+    pub fn cancel_by(&mut self, now: u64, agent: &str, goal: u64) {
+        let Some(record) = self.goals.get_mut(&goal) else {
+            return;
+        };
+        if *record.client == *agent {
+            self.stop(now, goal, Cause::Cancelled);
+        } else if matches!(record.state, State::Waiting | State::Running) {
+            record.operator = Some(agent.into());
+            self.stop(now, goal, Cause::CancelledByOperator);
+        }
+    }
+
     /// Handles that a conversation has ended without an outcome, because the client is gone. The goal
     /// goes on if it has another conversation.
     pub fn gone(&mut self, now: u64, conversation: u64) {
@@ -542,7 +563,7 @@ impl Executor {
     }
 
     /// Handles progress that a handler reports. A fraction that is not a number is left out, others are
-    /// brought into the range from 0 to 1.
+    /// brought into the range from 0 to 1. A value that is too long is left out.
     pub fn progress(&mut self, now: u64, goal: u64, progress: Progress) {
         let interval = self.limits.progress_interval;
         let Some(record) = self.goals.get_mut(&goal) else {
@@ -558,6 +579,7 @@ impl Executor {
         record.progress = Some(Progress {
             fraction: fraction.map(|part| part.clamp(0.0, 1.0)),
             note,
+            value: progress.value.filter(|it| length(it) <= MAX_PROGRESS),
         });
         let due = record
             .reported
@@ -577,7 +599,7 @@ impl Executor {
             return;
         };
         let outcome = match (&record.state, result) {
-            (State::Stopping(cause), Err(_)) => Err(cause.failure()),
+            (State::Stopping(cause), Err(_)) => Err(cause.failure(record.operator.as_deref())),
             (State::Running | State::Stopping(_), result) => result.map_err(bounded),
             _ => return,
         };
@@ -622,13 +644,21 @@ impl Executor {
         }
     }
 
-    /// Returns the status of the goals that run or wait, in the order of their arrival.
+    /// Returns the status of the goals that run or wait, in the order of their arrival. It has no values of
+    /// progress, which could be long together.
     #[must_use]
     pub fn status(&self, now: u64) -> Vec<GoalStatus> {
         let open = self.goals.iter().filter(|(_, record)| record.is_open());
         let mut open: Vec<_> = open.collect();
         open.sort_unstable_by_key(|(number, _)| **number);
-        open.iter().map(|(_, record)| record.status(now)).collect()
+        let all = open.iter().map(|(_, record)| record.status(now));
+        let without_value = all.map(|mut status| {
+            if let Some(progress) = &mut status.progress {
+                progress.value = None;
+            }
+            status
+        });
+        without_value.collect()
     }
 
     /// Returns the status of a goal.
@@ -641,6 +671,70 @@ impl Executor {
     #[must_use]
     pub fn find(&self, client: &str, id: &str) -> Option<u64> {
         self.ids.get(&(Arc::from(client), id.to_owned())).copied()
+    }
+
+    /// Returns the result of a goal, if it is done and its result is stored.
+    #[must_use]
+    pub fn result_of(&self, goal: u64) -> Option<&Term<'static>> {
+        match &self.goals.get(&goal)?.state {
+            State::Ended(Ok(result)) => result.as_ref(),
+            _ => None,
+        }
+    }
+
+    /// Returns the number of a goal that an agent asks for or wants to cancel. An agent that is not an operator may
+    /// do so with its own goals only.
+    ///
+    /// # Errors
+    /// If the goal is that of another client and the agent is not an operator, or the goal is unknown. Of several
+    /// clients with a goal of this id, those with an open goal count first.
+    pub fn find_for(&self, agent: &str, is_operator: bool, goal: &GoalRef) -> Result<u64, Refusal> {
+        let GoalRef { id, client } = goal;
+        let unknown = || Refusal::UnknownGoal(short(id));
+        if let Some(client) = client {
+            if client != agent && !is_operator {
+                return Err(Refusal::NotOperator(short(agent)));
+            }
+            return self.find(client, id).ok_or_else(unknown);
+        }
+        if let Some(own) = self.find(agent, id) {
+            return Ok(own);
+        }
+        if !is_operator {
+            return Err(Refusal::NotOperator(short(agent)));
+        }
+        let named = self.goals.iter().filter(|(_, record)| record.id == *id);
+        let (open, ended): (Vec<_>, Vec<_>) = named.partition(|(_, record)| record.is_open());
+        let found = if open.is_empty() { ended } else { open };
+        match found[..] {
+            [] => Err(unknown()),
+            [(number, _)] => Ok(*number),
+            _ => Err(Refusal::AmbiguousGoal(short(id))),
+        }
+    }
+
+    /// Returns the numbers of the goals of an action that run or wait, in the order of their arrival, which an operator
+    /// wants to cancel.
+    ///
+    /// # Errors
+    /// If the agent is not an operator, or the action is unknown.
+    pub fn open_of(
+        &self,
+        agent: &str,
+        is_operator: bool,
+        action: &str,
+    ) -> Result<Vec<u64>, Refusal> {
+        if !is_operator {
+            return Err(Refusal::NotOperator(short(agent)));
+        }
+        if !self.offers.contains_key(action) {
+            return Err(Refusal::UnknownAction(short(action)));
+        }
+        let open = self.goals.iter();
+        let open = open.filter(|(_, record)| record.is_open() && record.action == action);
+        let mut numbers: Vec<u64> = open.map(|(number, _)| *number).collect();
+        numbers.sort_unstable();
+        Ok(numbers)
     }
 
     /// Number of goals that run or wait.
@@ -751,7 +845,8 @@ impl Executor {
                 if let Some(offer) = self.offers.get_mut(&record.action) {
                     offer.waiting.retain(|waiting| *waiting != goal);
                 }
-                self.end(now, goal, Err(cause.failure()));
+                let failure = cause.failure(record.operator.as_deref());
+                self.end(now, goal, Err(failure));
             }
             State::Running => {
                 record.state = State::Stopping(cause);
@@ -785,9 +880,12 @@ impl Executor {
         }
         self.outputs.push_back(Output::Changed { goal });
         record.arguments = Vec::new();
+        if let Some(progress) = &mut record.progress {
+            progress.value = None;
+        }
         let waited = std::mem::take(&mut record.size);
         let size = match &outcome {
-            Ok(Some(value)) => Printer::new().print(value).map_or(0, |text| text.len()),
+            Ok(Some(value)) => length(value),
             Ok(None) => 0,
             Err(_) => MAX_TEXT,
         };
@@ -900,6 +998,7 @@ impl Record {
             age: now.saturating_sub(self.accepted),
             progress: self.progress.clone(),
             failure,
+            result: None,
         }
     }
 }

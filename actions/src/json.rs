@@ -7,9 +7,10 @@ use fipa_content::{Arguments, FunctionalTerm, Number, Parameter, Term};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use crate::CANCEL;
 use crate::description::ActionDescription;
 use crate::language::{Language, LanguageError};
-use crate::message::{ActionAnswer, Ask, Failure, Goal, GoalStatus, Refusal};
+use crate::message::{ActionAnswer, Ask, Failure, Goal, GoalRef, GoalStatus, Refusal};
 use crate::types::OBJECT;
 
 /// The key of the function symbol of an object.
@@ -32,6 +33,22 @@ struct JsonAsk {
     /// The goal that a query for the status is about.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     of: Option<String>,
+    /// The client of that goal.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    client: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    cancel: Option<JsonCancel>,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct JsonCancel {
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    goal: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    client: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    action: Option<String>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -63,7 +80,7 @@ enum JsonAnswer {
     Refused(Refusal),
     Failed(Failure),
     Actions(Vec<ActionDescription>),
-    Status(Vec<GoalStatus>),
+    Status(Vec<Value>),
 }
 
 impl Language for Json {
@@ -77,6 +94,8 @@ impl Language for Json {
             goal: None,
             query: None,
             of: None,
+            client: None,
+            cancel: None,
         };
         match ask {
             Ask::Goal(goal) => {
@@ -90,9 +109,24 @@ impl Language for Json {
             }
             Ask::Actions => json.query = Some(JsonQuery::Actions),
             Ask::Status => json.query = Some(JsonQuery::Status),
-            Ask::StatusOf(id) => {
+            Ask::StatusOf(GoalRef { id, client }) => {
                 json.query = Some(JsonQuery::Status);
                 json.of = Some(id.clone());
+                json.client.clone_from(client);
+            }
+            Ask::Cancel(GoalRef { id, client }) => {
+                json.cancel = Some(JsonCancel {
+                    goal: Some(id.clone()),
+                    client: client.clone(),
+                    action: None,
+                });
+            }
+            Ask::CancelAll(action) => {
+                json.cancel = Some(JsonCancel {
+                    goal: None,
+                    client: None,
+                    action: Some(action.clone()),
+                });
             }
         }
         Ok(serde_json::to_vec(&json)?)
@@ -100,18 +134,30 @@ impl Language for Json {
 
     fn read_ask(&self, bytes: &[u8]) -> Result<(String, Ask), LanguageError> {
         let json: JsonAsk = serde_json::from_slice(bytes)?;
-        let ask = match (json.goal, json.query, json.of) {
-            (Some(goal), None, None) => Ask::Goal(Goal {
+        const FORM: LanguageError = LanguageError::Form("either a goal, a query or a cancel");
+        let of = match (json.of, json.client) {
+            (Some(id), client) => Some(GoalRef { id, client }),
+            (None, None) => None,
+            (None, Some(_)) => return Err(FORM),
+        };
+        let ask = match (json.goal, json.query, of, json.cancel) {
+            (Some(goal), None, None, None) if goal.action == CANCEL => return Err(FORM),
+            (Some(goal), None, None, None) => Ask::Goal(Goal {
                 action: goal.action,
                 arguments: parameters(goal.arguments)?,
                 id: goal.id,
                 deadline: goal.deadline,
                 fence: goal.fence,
             }),
-            (None, Some(JsonQuery::Actions), None) => Ask::Actions,
-            (None, Some(JsonQuery::Status), None) => Ask::Status,
-            (None, Some(JsonQuery::Status), Some(id)) => Ask::StatusOf(id),
-            _ => return Err(LanguageError::Form("either a goal or a query")),
+            (None, Some(JsonQuery::Actions), None, None) => Ask::Actions,
+            (None, Some(JsonQuery::Status), None, None) => Ask::Status,
+            (None, Some(JsonQuery::Status), Some(goal), None) => Ask::StatusOf(goal),
+            (None, None, None, Some(cancel)) => match (cancel.goal, cancel.client, cancel.action) {
+                (Some(id), client, None) => Ask::Cancel(GoalRef { id, client }),
+                (None, None, Some(action)) => Ask::CancelAll(action),
+                _ => return Err(LanguageError::Form("a cancel of a goal or of an action")),
+            },
+            _ => return Err(FORM),
         };
         Ok((json.agent, ask))
     }
@@ -131,7 +177,9 @@ impl Language for Json {
             ActionAnswer::Refused(reason) => JsonAnswer::Refused(reason),
             ActionAnswer::Failed(reason) => JsonAnswer::Failed(reason),
             ActionAnswer::Actions(all) => JsonAnswer::Actions(all),
-            ActionAnswer::Status(all) => JsonAnswer::Status(all),
+            ActionAnswer::Status(all) => {
+                JsonAnswer::Status(all.iter().map(write_status).collect::<Result<_, _>>()?)
+            }
         };
         Ok(serde_json::to_vec(&json)?)
     }
@@ -145,8 +193,12 @@ impl Language for Json {
             (JsonAnswer::Done, Ask::Goal(_)) => Ok(ActionAnswer::Done(None)),
             (JsonAnswer::Result(value), Ask::Goal(_)) => Ok(ActionAnswer::Done(Some(term(value)?))),
             (JsonAnswer::Actions(all), Ask::Actions) => Ok(ActionAnswer::Actions(all)),
-            (JsonAnswer::Status(all), Ask::Status | Ask::StatusOf(_)) => {
-                Ok(ActionAnswer::Status(all))
+            (
+                JsonAnswer::Status(all),
+                Ask::Status | Ask::StatusOf(_) | Ask::Cancel(_) | Ask::CancelAll(_),
+            ) => {
+                let all = all.into_iter().map(read_status);
+                all.collect::<Result<_, _>>().map(ActionAnswer::Status)
             }
             _ => Err(LanguageError::Form("an answer to this message")),
         }
@@ -163,6 +215,35 @@ impl Language for Json {
             _ => Err(LanguageError::Form("a refusal or a failure")),
         }
     }
+}
+
+/// Writes a status. Its values are JSON as the result of a goal, not texts in SL.
+fn write_status(status: &GoalStatus) -> Result<Value, LanguageError> {
+    let mut written = serde_json::to_value(status)?;
+    let progress = status.progress.as_ref();
+    if let Some(value) = progress.and_then(|progress| progress.value.as_ref()) {
+        written["progress"]["value"] = json(value)?;
+    }
+    if let Some(result) = &status.result {
+        written["result"] = json(result)?;
+    }
+    Ok(written)
+}
+
+/// Reads a status.
+fn read_status(mut written: Value) -> Result<GoalStatus, LanguageError> {
+    let mut take = |pointer| {
+        let value = written.pointer_mut(pointer).map(Value::take);
+        let value = value.filter(|value| !value.is_null());
+        value.map(term).transpose()
+    };
+    let (value, result) = (take("/progress/value")?, take("/result")?);
+    let mut status: GoalStatus = serde_json::from_value(written)?;
+    if let Some(progress) = &mut status.progress {
+        progress.value = value;
+    }
+    status.result = result;
+    Ok(status)
 }
 
 fn object(parameters: &[Parameter<'_>]) -> Result<Map<String, Value>, LanguageError> {

@@ -59,7 +59,8 @@ pub use executor::{
 pub use json::Json;
 pub use language::{Language, LanguageError, language};
 pub use message::{
-    ActionAnswer, Ask, Failure, Goal, GoalError, GoalState, GoalStatus, Progress, Refusal,
+    ActionAnswer, Ask, Failure, Goal, GoalError, GoalRef, GoalState, GoalStatus, Progress,
+    ProgressError, Refusal,
 };
 pub use sl::Sl;
 pub use types::{Field, Mismatch, Type};
@@ -72,6 +73,12 @@ pub const RESERVED: [&str; 3] = ["goal", "deadline", "fence"];
 
 /// Maximum length of a goal's content in bytes.
 pub const MAX_CONTENT: usize = 1 << 20;
+
+/// Name that no action can have, because it cancels goals.
+pub const CANCEL: &str = "cancel-goals";
+
+/// Maximum length of the value of a progress in SL, in bytes.
+pub const MAX_PROGRESS: usize = 64 << 10;
 
 /// Maximum length of names, goal ids and fences in bytes.
 pub const MAX_NAME: usize = 256;

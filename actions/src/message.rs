@@ -3,9 +3,10 @@
 use std::borrow::Cow;
 
 use fipa_acl::escape;
-use fipa_content::{Arguments, FunctionalTerm, Parameter, SerializeError, Term};
+use fipa_content::{Arguments, FunctionalTerm, Parameter, Printer, SerializeError, Term};
 use serde::{Deserialize, Serialize};
 
+use crate::MAX_PROGRESS;
 use crate::description::ActionDescription;
 
 /// The content of a message to a robot.
@@ -18,8 +19,41 @@ pub enum Ask {
     Actions,
     /// Report the status of all goals (`query-ref`, `subscribe`).
     Status,
-    /// Report the status of the goal of the asking client with this id (`query-ref`, `subscribe`).
-    StatusOf(String),
+    /// Report the status of a goal (`query-ref`, `subscribe`); in the answer to `query-ref` with its result.
+    StatusOf(GoalRef),
+    /// Cancel a goal (`request`).
+    Cancel(GoalRef),
+    /// Cancel all goals of the action with this name (`request`).
+    CancelAll(String),
+}
+
+/// Names a goal that the robot has accepted.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GoalRef {
+    /// The id of the goal.
+    pub id: String,
+    /// The name of its client. Without it, the goal is that of the asking client, or else that of another client.
+    pub client: Option<String>,
+}
+
+impl GoalRef {
+    /// Names the goal of the client with this name.
+    #[must_use]
+    pub fn of(self, client: impl Into<String>) -> Self {
+        Self {
+            client: Some(client.into()),
+            ..self
+        }
+    }
+}
+
+impl<T: Into<String>> From<T> for GoalRef {
+    fn from(id: T) -> Self {
+        Self {
+            id: id.into(),
+            client: None,
+        }
+    }
 }
 
 /// A goal: the action with its arguments.
@@ -148,9 +182,18 @@ pub enum Refusal {
     /// The agent does not offer the action.
     #[error("unknown action {}", escape(.0))]
     UnknownAction(String),
-    /// The client has no goal with this id.
+    /// No goal with this id is stored.
     #[error("unknown goal {}", escape(.0))]
     UnknownGoal(String),
+    /// Several clients have a goal with this id.
+    #[error("several clients have a goal {}; name the client", escape(.0))]
+    AmbiguousGoal(String),
+    /// The agent with this name is not an operator of the robot, and named goals that are not its own.
+    #[error(
+        "{} may name its own goals only, because it is not an operator of the robot (access.operators)",
+        escape(.0)
+    )]
+    NotOperator(String),
     /// A parameter without a default is missing.
     #[error("the parameter {} is missing", escape(.0))]
     MissingParameter(String),
@@ -203,6 +246,9 @@ pub enum Failure {
     /// The client cancelled.
     #[error("cancelled by the client")]
     Cancelled,
+    /// The operator with this name cancelled.
+    #[error("cancelled by the operator {}", escape(.0))]
+    CancelledBy(String),
     /// The client left or died.
     #[error("cancelled, because the client is gone")]
     ClientGone,
@@ -239,6 +285,21 @@ pub struct Progress {
     pub fraction: Option<f64>,
     /// The present step in words.
     pub note: Option<String>,
+    /// A value of the action, for example the present pose. The status of all goals, and that of an ended
+    /// goal, has none.
+    pub value: Option<Term<'static>>,
+}
+
+/// The error of a value that cannot be reported as progress.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ProgressError {
+    /// SL has no notation for the value.
+    #[error(transparent)]
+    Serialize(#[from] SerializeError),
+    /// The value is too large. Holds its length in SL.
+    #[error("the value of the progress has {0} bytes; the maximum is {MAX_PROGRESS}")]
+    TooLarge(usize),
 }
 
 impl Progress {
@@ -247,7 +308,7 @@ impl Progress {
     pub fn fraction(part: f64) -> Self {
         Self {
             fraction: Some(part),
-            note: None,
+            ..Self::default()
         }
     }
 
@@ -257,6 +318,21 @@ impl Progress {
         Self {
             note: Some(note.into()),
             ..self
+        }
+    }
+
+    /// Sets a value of the action, for example the present pose.
+    ///
+    /// # Errors
+    /// If SL has no notation for a part of the value, or it is longer than 64 KiB there.
+    pub fn value(self, value: &(impl Serialize + ?Sized)) -> Result<Self, ProgressError> {
+        let value = Term::from_value(value)?;
+        match length(&value) {
+            length if length > MAX_PROGRESS => Err(ProgressError::TooLarge(length)),
+            _ => Ok(Self {
+                value: Some(value),
+                ..self
+            }),
         }
     }
 }
@@ -317,6 +393,13 @@ pub struct GoalStatus {
     pub progress: Option<Progress>,
     /// The reason, if the goal failed.
     pub failure: Option<Failure>,
+    /// The result of the goal that was asked for, if it is done and has one.
+    pub result: Option<Term<'static>>,
+}
+
+/// Returns the length of a value in SL; 0 if it has no notation.
+pub(crate) fn length(value: &Term<'_>) -> usize {
+    Printer::new().print(value).map_or(0, |text| text.len())
 }
 
 /// Returns a parameter.

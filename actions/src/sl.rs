@@ -8,13 +8,15 @@ use fipa_content::{
     ReadError, ReferentialOperator, Term, Wff,
 };
 
+use crate::CANCEL;
 use crate::language::{Language, LanguageError};
-use crate::message::{ActionAnswer, Ask, Goal, parameter};
+use crate::message::{ActionAnswer, Ask, Goal, GoalRef, parameter};
 
 /// The predicate of offered actions: `(offers agent ?action)`.
 const OFFERS: &str = "offers";
 
-/// The predicate of goals: `(performs agent ?status)`, `(performs agent id ?status)`.
+/// The predicate of goals: `(performs agent ?status)`, `(performs agent id ?status)`,
+/// `(performs agent id client ?status)`.
 const PERFORMS: &str = "performs";
 
 /// FIPA-SL, the language without which no agent is: `fipa-sl`.
@@ -29,6 +31,7 @@ impl Language for Sl {
     fn write_ask(&self, robot: &AgentId, ask: &Ask) -> Result<Vec<u8>, LanguageError> {
         let content = match ask {
             Ask::Goal(goal) => action(robot, act(goal)).into(),
+            Ask::Cancel(_) | Ask::CancelAll(_) => action(robot, reference(ask)).into(),
             _ => query(robot, ask).content(),
         };
         Ok(Printer::new().print(&content)?)
@@ -39,7 +42,11 @@ impl Language for Sl {
         if let Ok(ActionExpression::Action { agent, act }) = content.action() {
             let agent = AgentId::try_from(agent).map_err(ReadError::from)?;
             let goal = goal(act.clone().into_owned())?;
-            return Ok((agent.name().to_owned(), Ask::Goal(goal)));
+            let ask = match goal.action == CANCEL {
+                true => cancel(goal)?,
+                false => Ask::Goal(goal),
+            };
+            return Ok((agent.name().to_owned(), ask));
         }
         asked(&Query::read(&content)?)
     }
@@ -68,6 +75,11 @@ impl Language for Sl {
                 Content::of_refusal(reference(), Wff::from_value(reason)?)
             }
             ActionAnswer::Actions(all) => query(robot, to).answer_all(all)?,
+            ActionAnswer::Status(all) if matches!(to, Ask::Cancel(_) | Ask::CancelAll(_)) => {
+                let all = all.iter().map(Term::from_value).collect::<Result<_, _>>()?;
+                let of = Box::new(Term::from(reference()));
+                Wff::Result(of, Box::new(Term::Set(all))).into()
+            }
             ActionAnswer::Status(all) => query(robot, to).answer_all(all)?,
         };
         Ok(Printer::new().print(&content)?)
@@ -89,8 +101,8 @@ impl Language for Sl {
             };
         }
         // Other robots may repeat the query in another notation, so it is not compared.
-        let Wff::Equal(_, value) = content.wff()? else {
-            return Err(LanguageError::Form("((= (all …) (set …)))"));
+        let (Wff::Equal(_, value) | Wff::Result(_, value)) = content.wff()? else {
+            return Err(LanguageError::Form("((= (all …) (set …))) or ((result …))"));
         };
         let read = |error| LanguageError::Read(ReadError::Value(error));
         match to {
@@ -156,7 +168,55 @@ fn reference(ask: &Ask) -> Term<'static> {
         }
         Ask::Actions => functional(OFFERS, Vec::new()),
         Ask::Status => functional(PERFORMS, Vec::new()),
-        Ask::StatusOf(id) => functional(PERFORMS, vec![parameter("goal", id.clone())]),
+        Ask::StatusOf(goal) => functional(PERFORMS, named(goal)),
+        Ask::Cancel(goal) => functional(CANCEL, named(goal)),
+        Ask::CancelAll(action) => functional(CANCEL, vec![parameter("action", action.clone())]),
+    }
+}
+
+/// Returns the parameters that name a goal.
+fn named(goal: &GoalRef) -> Vec<Parameter<'static>> {
+    let client = goal.client.iter();
+    let client = client.map(|name| parameter("client", name.clone()));
+    [parameter("goal", goal.id.clone())]
+        .into_iter()
+        .chain(client)
+        .collect()
+}
+
+/// Reads the act of a cancel, which has the form of a goal.
+fn cancel(goal: Goal) -> Result<Ask, LanguageError> {
+    const FORM: LanguageError = LanguageError::Form(
+        "(cancel-goals :goal id), (cancel-goals :goal id :client name) or (cancel-goals :action name)",
+    );
+    if goal.deadline.is_some() || goal.fence.is_some() {
+        return Err(FORM);
+    }
+    let (mut client, mut action) = (None, None);
+    for Parameter { name, value } in goal.arguments {
+        let slot = match &*name {
+            "client" => &mut client,
+            "action" => &mut action,
+            _ => return Err(FORM),
+        };
+        let word = word(&value).ok_or(FORM)?;
+        if slot.replace(word).is_some() {
+            return Err(FORM);
+        }
+    }
+    match (goal.id, client, action) {
+        (Some(id), client, None) => Ok(Ask::Cancel(GoalRef { id, client })),
+        (None, None, Some(action)) => Ok(Ask::CancelAll(action)),
+        _ => Err(FORM),
+    }
+}
+
+/// Reads an id or a name. In SL, one of digits only is a number.
+fn word(term: &Term<'_>) -> Option<String> {
+    match term {
+        Term::String(text) => Some(text.clone().into_owned()),
+        Term::Number(number) => Some(number.as_str().to_owned()),
+        _ => None,
     }
 }
 
@@ -208,7 +268,11 @@ fn query(robot: &AgentId, ask: &Ask) -> Query {
     let variable = Term::Variable(Cow::Borrowed("x"));
     let robot = Term::from(robot);
     let wff = match ask {
-        Ask::StatusOf(id) => Wff::predicate(PERFORMS, [robot, Term::from(id.clone()), variable]),
+        Ask::StatusOf(GoalRef { id, client }) => {
+            let client = client.iter().map(|name| Term::from(name.clone()));
+            let named = [robot, Term::from(id.clone())].into_iter().chain(client);
+            Wff::predicate(PERFORMS, named.chain([variable]))
+        }
         Ask::Status => Wff::predicate(PERFORMS, [robot, variable]),
         _ => Wff::predicate(OFFERS, [robot, variable]),
     };
@@ -229,11 +293,12 @@ fn asked(query: &Query) -> Result<(String, Ask), LanguageError> {
     let (agent, ask) = match (&**symbol, &arguments[..]) {
         (OFFERS, [agent, Term::Variable(_)]) => (agent, Ask::Actions),
         (PERFORMS, [agent, Term::Variable(_)]) => (agent, Ask::Status),
-        (PERFORMS, [agent, Term::String(id), Term::Variable(_)]) => {
-            (agent, Ask::StatusOf(id.clone().into_owned()))
+        (PERFORMS, [agent, id, Term::Variable(_)]) => {
+            (agent, Ask::StatusOf(word(id).ok_or(FORM)?.into()))
         }
-        (PERFORMS, [agent, Term::Number(id), Term::Variable(_)]) => {
-            (agent, Ask::StatusOf(id.as_str().to_owned()))
+        (PERFORMS, [agent, id, client, Term::Variable(_)]) => {
+            let goal = GoalRef::from(word(id).ok_or(FORM)?);
+            (agent, Ask::StatusOf(goal.of(word(client).ok_or(FORM)?)))
         }
         _ => return Err(FORM),
     };

@@ -3,8 +3,9 @@
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use fipa_actions::{
-    ActionDescription, ActionLimits, Cause, Executor, Failure, Goal, GoalState, OfferOptions,
-    OfferRefused, Orphans, Output, ParameterDescription, Policy, Progress, Refusal,
+    ActionDescription, ActionLimits, Cause, Executor, Failure, Goal, GoalRef, GoalState,
+    MAX_PROGRESS, OfferOptions, OfferRefused, Orphans, Output, ParameterDescription, Policy,
+    Progress, ProgressError, Refusal,
 };
 use fipa_content::{Parameter, Term};
 
@@ -232,6 +233,104 @@ fn a_cancel_a_deadline_and_a_dead_client_stop_a_goal() {
 }
 
 #[test]
+fn an_operator_cancels_goals_of_other_clients_and_others_do_not() {
+    let mut executor = with(Policy::Queue(8));
+    for (conversation, client, id) in [(1, "rover", "a"), (2, "arm", "a"), (3, "arm", "b")] {
+        executor
+            .request(0, conversation, client, id, goal(""))
+            .unwrap();
+    }
+    let first = started(&mut executor);
+    let of = |client: &str| GoalRef::from("a").of(client);
+    let refused = |agent: &str| Err(Refusal::NotOperator(agent.to_owned()));
+    let unknown = |id: &str| Err(Refusal::UnknownGoal(id.to_owned()));
+    for (agent, is_operator, named, found) in [
+        ("rover", false, "a".into(), Ok(first)),
+        ("rover", false, of("rover"), Ok(first)),
+        ("rover", false, of("arm"), refused("rover")),
+        ("rover", false, "b".into(), refused("rover")),
+        ("rover", false, "c".into(), refused("rover")),
+        ("rover", false, GoalRef::from("c").of("rover"), unknown("c")),
+        ("rover", true, "a".into(), Ok(first)),
+        ("boss", true, of("rover"), Ok(first)),
+        ("boss", true, "b".into(), Ok(first + 2)),
+        ("boss", true, of("crane"), unknown("a")),
+        ("boss", true, "c".into(), unknown("c")),
+        (
+            "boss",
+            true,
+            "a".into(),
+            Err(Refusal::AmbiguousGoal("a".to_owned())),
+        ),
+    ] {
+        let result = executor.find_for(agent, is_operator, &named);
+        assert_eq!(result, found, "{agent} {named:?}");
+    }
+    let refusal = executor.open_of("rover", false, "drive");
+    assert_eq!(refusal, Err(Refusal::NotOperator("rover".to_owned())));
+    let refusal = executor.open_of("boss", true, "fly");
+    assert_eq!(refusal, Err(Refusal::UnknownAction("fly".to_owned())));
+    let open = executor.open_of("boss", true, "drive").unwrap();
+    assert_eq!(open, [first, first + 1, first + 2]);
+
+    let by = |name: &str| Err(Failure::CancelledBy(name.to_owned()));
+    executor.cancel_by(1, "boss", first + 1);
+    assert_eq!(outputs(&mut executor), [finish(2, by("boss"))]);
+    // The goal that has ended does not count beside one that runs.
+    assert_eq!(executor.find_for("boss", true, &"a".into()), Ok(first));
+    executor.cancel_by(2, "boss", first);
+    executor.cancel_by(2, "chief", first);
+    executor.cancel(2, 1);
+    let cause = Cause::CancelledByOperator;
+    assert_eq!(
+        outputs(&mut executor),
+        [Output::Stop { goal: first, cause }]
+    );
+    executor.ended(3, first, Err(Failure::Failed("stopped".to_owned())));
+    let [finished, Output::Start(_)] = &outputs(&mut executor)[..] else {
+        panic!()
+    };
+    assert_eq!(*finished, finish(1, by("boss")));
+    executor.cancel_by(4, "arm", first + 2);
+    let cause = Cause::Cancelled;
+    let goal = first + 2;
+    assert_eq!(outputs(&mut executor), [Output::Stop { goal, cause }]);
+    executor.ended(4, first + 2, Ok(Some(Term::from("there"))));
+    executor.cancel_by(5, "boss", first + 2);
+    assert_eq!(executor.result_of(first + 2), Some(&Term::from("there")));
+    assert_eq!(executor.result_of(first), None);
+}
+
+#[test]
+fn the_value_of_a_progress_is_bounded() {
+    let long = "x".repeat(MAX_PROGRESS + 1);
+    let error = Progress::default().value(&long).unwrap_err();
+    assert_eq!(error, ProgressError::TooLarge(MAX_PROGRESS + 1));
+    let mut executor = with(Policy::Reject);
+    executor.request(0, 1, "rover", "a", goal("")).unwrap();
+    let goal = started(&mut executor);
+    let mut value = |value| {
+        let progress = Progress {
+            value: Some(Term::from(value)),
+            ..Progress::fraction(0.5)
+        };
+        executor.progress(1, goal, progress);
+        // The list of all goals could become long.
+        assert_eq!(
+            executor.status(1)[0].progress,
+            Some(Progress::fraction(0.5))
+        );
+        executor.status_of(1, goal).unwrap().progress.unwrap().value
+    };
+    assert_eq!(value("near".to_owned()), Some(Term::from("near")));
+    assert_eq!(value(long), None);
+    assert_eq!(value("near".to_owned()), Some(Term::from("near")));
+    executor.ended(2, goal, Ok(None));
+    let ended = executor.status_of(2, goal).unwrap();
+    assert_eq!(ended.progress, Some(Progress::fraction(0.5)), "not stored");
+}
+
+#[test]
 fn an_orphan_goes_on_if_the_action_says_so() {
     let mut executor = Executor::new(ActionLimits::default());
     let options = OfferOptions {
@@ -379,6 +478,9 @@ fn descriptions_that_cannot_be_met_are_not_offered() {
         .push(ParameterDescription::of::<f64>("fence"));
     let refused = executor.offer(reserved, OfferOptions::default());
     assert_eq!(refused, Err(OfferRefused::Name("fence".to_owned())));
+    let reserved = ActionDescription::new("cancel-goals");
+    let refused = executor.offer(reserved, OfferOptions::default());
+    assert_eq!(refused, Err(OfferRefused::Name("cancel-goals".to_owned())));
     let mut wrong = ActionDescription::new("drive");
     let speed = ParameterDescription::of::<f64>("speed").range(0.0..=0.5);
     wrong.parameters.push(speed.default(&3).unwrap());

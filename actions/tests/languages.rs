@@ -4,7 +4,7 @@
 
 use fipa_acl::AgentId;
 use fipa_actions::{
-    ActionAnswer, ActionDescription, ActionLimits, Ask, Executor, Failure, Goal, GoalState, Json,
+    ActionAnswer, ActionDescription, ActionLimits, Ask, Executor, Failure, Goal, GoalRef, Json,
     Language, OfferOptions, ParameterDescription, Policy, Progress, Refusal, Sl, Type, language,
 };
 use fipa_content::Term;
@@ -31,8 +31,12 @@ fn asks() -> Vec<Ask> {
         Ask::Goal(goal("(stop)")),
         Ask::Actions,
         Ask::Status,
-        Ask::StatusOf("17".to_owned()),
-        Ask::StatusOf("rover 7".to_owned()),
+        Ask::StatusOf("17".into()),
+        Ask::StatusOf(GoalRef::from("rover 7").of("17")),
+        Ask::Cancel("17".into()),
+        Ask::Cancel(GoalRef::from("rover 7").of("rover")),
+        Ask::CancelAll("7".to_owned()),
+        Ask::CancelAll("two words".to_owned()),
     ]
 }
 
@@ -44,6 +48,8 @@ fn refusals() -> Vec<Refusal> {
         Refusal::NotThisAgent("7".to_owned()),
         Refusal::UnknownAction(text()),
         Refusal::UnknownGoal(text()),
+        Refusal::AmbiguousGoal("7".to_owned()),
+        Refusal::NotOperator(text()),
         Refusal::MissingParameter(text()),
         Refusal::UnknownParameter(text()),
         Refusal::RepeatedParameter(text()),
@@ -65,6 +71,7 @@ fn failures() -> Vec<Failure> {
         Failure::Failed("no (power)".to_owned()),
         Failure::Failed(String::new()),
         Failure::Cancelled,
+        Failure::CancelledBy("7".to_owned()),
         Failure::ClientGone,
         Failure::DeadlinePassed,
         Failure::Preempted,
@@ -109,15 +116,21 @@ fn status() -> Vec<fipa_actions::GoalStatus> {
     let numbers: Vec<u64> = ["a", "b", "c"]
         .map(|id| executor.find("rover", id).unwrap())
         .into();
-    executor.progress(5, numbers[0], Progress::fraction(0.5).note("half"));
-    executor.progress(5, numbers[0], Progress::default());
-    executor.cancel(6, 3);
+    let pose = Term::parse("(pose :through (sequence 1 \"7\") :x 1.5)").unwrap();
+    let half = Progress::fraction(0.5).note("half");
+    executor.progress(5, numbers[0], half.value(&pose.into_owned()).unwrap());
+    executor.cancel_by(6, "boss", numbers[2]);
     while executor.poll_output().is_some() {}
     let all = numbers
         .iter()
         .map(|number| executor.status_of(9, *number).unwrap());
-    let all: Vec<_> = all.collect();
-    assert_eq!(all[2].state, GoalState::Failed);
+    let mut all: Vec<_> = all.collect();
+    assert!(all[0].progress.as_ref().unwrap().value.is_some());
+    assert_eq!(
+        all[2].failure,
+        Some(Failure::CancelledBy("boss".to_owned()))
+    );
+    all[1].result = Some(Term::from("two words"));
     all
 }
 
@@ -164,8 +177,11 @@ fn answers_survive_both_languages() {
             (Ask::Actions, ActionAnswer::Actions(descriptions())),
             (Ask::Actions, ActionAnswer::Actions(Vec::new())),
             (Ask::Status, ActionAnswer::Status(status())),
+            (Ask::StatusOf("a".into()), ActionAnswer::Status(Vec::new())),
+            (Ask::StatusOf("a".into()), ActionAnswer::Status(status())),
+            (Ask::Cancel("a".into()), ActionAnswer::Status(status())),
             (
-                Ask::StatusOf("a".to_owned()),
+                Ask::CancelAll("a".to_owned()),
                 ActionAnswer::Status(Vec::new()),
             ),
         ] {
@@ -237,6 +253,14 @@ fn other_notations_are_read_and_wrong_ones_are_errors() {
         "((action crex (dock)))",
         "((iota ?x (offers (agent-identifier :name crex) ?x)))",
         "((all ?x (likes (agent-identifier :name crex) ?x)))",
+        "((action (agent-identifier :name crex) (cancel-goals)))",
+        "((action (agent-identifier :name crex) cancel-goals))",
+        "((action (agent-identifier :name crex) (cancel-goals :client a)))",
+        "((action (agent-identifier :name crex) (cancel-goals :goal a :action b)))",
+        "((action (agent-identifier :name crex) (cancel-goals :goal a :deadline 1)))",
+        "((action (agent-identifier :name crex) (cancel-goals :action a :action b)))",
+        "((action (agent-identifier :name crex) (cancel-goals :goal a :force true)))",
+        "((all ?x (performs (agent-identifier :name crex) (set) ?x)))",
         "((done (action (agent-identifier :name crex) (dock))))",
         "",
         "(",
@@ -249,6 +273,13 @@ fn other_notations_are_read_and_wrong_ones_are_errors() {
         "{\"agent\":\"crex\",\"query\":\"status\",\"goal\":{\"action\":\"a\"}}",
         "{\"agent\":\"crex\",\"goal\":{\"action\":\"a\",\"deadline\":-1}}",
         "{\"agent\":\"crex\",\"goal\":{\"action\":\"a\",\"arguments\":{\"x\":{\"@\":1}}}}",
+        "{\"agent\":\"crex\",\"goal\":{\"action\":\"cancel-goals\"}}",
+        "{\"agent\":\"crex\",\"cancel\":{}}",
+        "{\"agent\":\"crex\",\"cancel\":{\"goal\":\"a\",\"action\":\"b\"}}",
+        "{\"agent\":\"crex\",\"cancel\":{\"client\":\"a\"}}",
+        "{\"agent\":\"crex\",\"cancel\":{\"goal\":\"a\",\"force\":true}}",
+        "{\"agent\":\"crex\",\"query\":\"status\",\"client\":\"a\"}",
+        "{\"agent\":\"crex\",\"query\":\"status\",\"cancel\":{\"goal\":\"a\"}}",
         "[",
     ] {
         assert!(Json.read_ask(wrong.as_bytes()).is_err(), "{wrong}");

@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use bytesize::ByteSize;
-use clap::error::{ContextKind, ContextValue};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{
     ArgAction, ArgMatches, Args, Command as Clap, CommandFactory, FromArgMatches, Parser, ValueHint,
 };
@@ -15,7 +15,7 @@ use fipa::error::ErrorChain;
 use fipa::threads;
 use tokio::runtime;
 
-use crate::command::Command;
+use crate::command::{Command, topics};
 use crate::complete;
 use crate::report::{self, Failure};
 
@@ -48,7 +48,12 @@ impl CommandLine {
     /// when the option is also given after it.
     pub(crate) fn read() -> Self {
         let matches = command().try_get_matches();
-        let matches = matches.unwrap_or_else(|error| report::usage(&with_meant_command(error)));
+        let matches = matches.unwrap_or_else(|error| {
+            let arguments: Vec<_> = std::env::args_os()
+                .map(|it| it.to_string_lossy().into_owned())
+                .collect();
+            report::usage(&with_topic(with_meant_command(error), &arguments))
+        });
         let read = || {
             let mut line = Self::from_arg_matches(&matches)?;
             line.global = Global::of(&matches)?;
@@ -81,6 +86,22 @@ fn with_meant_command(mut error: clap::Error) -> clap::Error {
         ContextKind::SuggestedSubcommand,
         ContextValue::Strings(meant),
     );
+    error
+}
+
+/// Splits the path of a topic of ROS, where `fipa subscribe` has two arguments.
+fn with_topic(mut error: clap::Error, arguments: &[String]) -> clap::Error {
+    if error.kind() == ErrorKind::MissingRequiredArgument
+        && let Some(at) = arguments.iter().position(|it| it == "subscribe")
+        && let Some(name) = arguments.get(at + 1)
+        && let Some((publisher, topic)) = topics::of_publisher(name)
+    {
+        let tip = format!(
+            "the agent and the topic are two arguments: fipa subscribe {publisher} {topic}"
+        );
+        let tips = ContextValue::StyledStrs(vec![tip.into()]);
+        error.insert(ContextKind::Suggested, tips);
+    }
     error
 }
 

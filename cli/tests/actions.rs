@@ -54,6 +54,7 @@ fn robot_process() {
         set: vec![
             format!("domain={domain}"),
             "discovery.mdns=false".to_owned(),
+            "access.operators=boss".to_owned(),
             DEADLINE.to_owned(),
         ],
         ..Sources::default()
@@ -75,7 +76,8 @@ fn robot_process() {
             })
         });
         let drive = crex.offer(Action::new("drive"), |(): (), run: Execution| async move {
-            run.progress(Progress::fraction(0.5).note("half-way"));
+            let at = Pose { x: 0.5, y: 2.0 };
+            run.progress(Progress::fraction(0.5).note("half-way").value(&at).unwrap());
             let cause = run.stopped().await;
             Err::<(), _>(format!("{cause:?}"))
         });
@@ -219,6 +221,76 @@ fn a_goal_that_the_same_agent_sends_again_does_not_run_again() {
 }
 
 #[test]
+fn an_operator_cancels_goals_of_other_clients() {
+    let host = Host::new();
+    let _robot = robot(&host);
+    let drive = ["--set", DEADLINE, "do", "crex", "drive", "--json"];
+    let started = || {
+        let running = host.start(&drive);
+        let accepted: Value = serde_json::from_str(&running.ready).unwrap();
+        (running, accepted["goal"].as_str().unwrap().to_owned())
+    };
+    let asked = |option: &str, name: &str, agent: &str| {
+        run(&host, &["actions", "crex", option, name, "--agent", agent])
+    };
+    let (mut running, id) = started();
+    for (option, name) in [
+        ("--goal", &*id),
+        ("--cancel", &id),
+        ("--cancel-all", "drive"),
+    ] {
+        let refused = asked(option, name, "arm").failed(1);
+        for part in ["arm may name its own goals only", "operators = [\"arm\"]"] {
+            assert!(refused.contains(part), "{part}: {refused}");
+        }
+    }
+    let shown = asked("--goal", &id, "boss").done();
+    for part in [&*id, "executing", "50 % half-way", "(pose :x 0.5 :y 2.0)"] {
+        assert!(shown.contains(part), "{part}: {shown}");
+    }
+    let by_boss = "cancelled by the operator boss";
+    let cancelled = [
+        "actions", "crex", "--cancel", &id, "--agent", "boss", "--json",
+    ];
+    let cancelled = run(&host, &cancelled).done_json();
+    assert_eq!(cancelled[0]["goals"][0]["goal"], id);
+    assert_eq!(cancelled[0]["goals"][0]["failure"], by_boss);
+    let (code, errors) = running.end();
+    assert_eq!(code, Some(1));
+    assert!(errors.contains(by_boss), "{errors}");
+
+    let (mut running, id) = started();
+    let cancelled = asked("--cancel-all", "drive", "boss").done();
+    assert!(
+        cancelled.contains(&id) && cancelled.contains(by_boss),
+        "{cancelled}"
+    );
+    assert_eq!(running.end().0, Some(1));
+    let none = asked("--cancel-all", "drive", "boss").done();
+    assert_eq!(none, "crex runs no goals of this action\n");
+    let unknown = asked("--cancel-all", "fly", "boss").failed(1);
+    assert!(unknown.contains("unknown action fly"), "{unknown}");
+    let unknown = asked("--cancel", "none", "boss").failed(1);
+    assert!(unknown.contains("--goals"), "{unknown}");
+
+    let goal = ["do", "crex", "count", "--agent", "rover", "--id", "g-1"];
+    run(&host, &goal).done();
+    for agent in ["boss", "rover"] {
+        let shown = [
+            "actions", "crex", "--goal", "g-1", "--agent", agent, "--json",
+        ];
+        let shown = run(&host, &shown).done_json();
+        let goal = &shown[0]["goals"][0];
+        assert_eq!(
+            (&goal["state"], &goal["result"]),
+            (&json!("done"), &json!("1"))
+        );
+    }
+    let alone = run(&host, &["actions", "--cancel", "g-1"]).failed(2);
+    assert!(alone.contains("ROBOT"), "{alone}");
+}
+
+#[test]
 fn a_signal_cancels_the_goal() {
     let host = Host::new();
     let mut robot = robot(&host);
@@ -229,6 +301,7 @@ fn a_signal_cancels_the_goal() {
         assert_eq!(progress["event"], "progress");
         if progress["fraction"] == 0.5 {
             assert_eq!(progress["note"], "half-way");
+            assert_eq!(progress["value"], "(pose :x 0.5 :y 2.0)");
             break;
         }
     }

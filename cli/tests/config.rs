@@ -138,6 +138,7 @@ networks = []                        # default
 
 [access]
 rate = 0                             # default
+operators = []                       # default
 
 [monitor]
 check = \"off\"                        # default

@@ -324,6 +324,21 @@ fn topics_lists_topics_with_their_rates_and_subscribers() {
     viewer.send_signal("-CONT");
     let watched = host.run(&["topics", "--watch", "--for", "2s"]).done();
     assert!(watched.matches("AGENT").count() > 1, "{watched}");
+    let tip = "fipa subscribe camera image";
+    for (arguments, code) in [
+        (&["subscribe", "camera/image"][..], 2),
+        (&["subscribe", "/camera/image"], 2),
+        (&["subscribe", "camera/image", "image"], 1),
+        (&["topics", "camera/image"], 1),
+    ] {
+        let split = host.run(arguments).failed(code);
+        assert!(split.contains(tip), "{arguments:?}: {split}");
+    }
+    let refused = host.run(&["subscribe", "camera", "imag"]).failed(1);
+    for part in ["topics: image", "`fipa topics camera`"] {
+        assert!(refused.contains(part), "{refused}");
+    }
+    assert!(!refused.contains(":conversation-id"), "{refused}");
     let unknown = host.run(&["topics", "unknown"]).failed(1);
     assert!(unknown.contains("no such agent"), "{unknown}");
     drop(gateway);

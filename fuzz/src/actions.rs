@@ -3,7 +3,7 @@
 //! * An admitted goal has arguments of the described types and ranges.
 //! * Each admitted goal starts at most once, and each of its conversations gets at most one outcome.
 //! * The goals and their bytes stay within their bounds.
-//! * The goal of the honest client is not changed by others.
+//! * The goal of the honest client is not changed by others, also not by cancels.
 
 use std::collections::{HashMap, HashSet};
 
@@ -19,13 +19,16 @@ use crate::input::Input;
 const HONEST: &str = "crane";
 const CLIENTS: [&str; 3] = ["rover", "arm", "probe"];
 const LANGUAGES: [&dyn Language; 2] = [&Sl, &Json];
-const ACTS: [&str; 6] = [
+const ACTS: [&str; 9] = [
     "(drive :speed 0.25)",
     "(drive :speed (quantity :value 0.1 :unit m/s) :goal a :deadline 100)",
     "(say :text \"some words\" :goal b)",
     "(say :text x :fence \"1.2@crane\")",
     "(hold)",
     "(fly :height 3)",
+    "(cancel-goals :goal a)",
+    "(cancel-goals :goal mine :client crane)",
+    "(cancel-goals :action hold)",
 ];
 
 fn offered() -> [(ActionDescription, OfferOptions); 3] {
@@ -163,11 +166,25 @@ pub fn play(bytes: &[u8]) {
             _ => {
                 let language = LANGUAGES[input.below(2)];
                 let content = content(&mut input, language);
-                let Ok((_, Ask::Goal(goal))) = language.read_ask(&content) else {
-                    continue;
+                let client = input.one_of(&CLIENTS);
+                // No client is an operator, so each finds its own goals only.
+                let goal = match language.read_ask(&content) {
+                    Ok((_, Ask::Goal(goal))) => goal,
+                    Ok((_, Ask::Cancel(named))) => {
+                        if let Ok(goal) = executor.find_for(client, false, &named) {
+                            let found = executor.status_of(now, goal).expect("a goal");
+                            assert_eq!((&*found.client, found.goal), (client, named.id));
+                            executor.cancel_by(now, client, goal);
+                        }
+                        continue;
+                    }
+                    Ok((_, Ask::CancelAll(action))) => {
+                        assert!(executor.open_of(client, false, &action).is_err());
+                        continue;
+                    }
+                    _ => continue,
                 };
                 conversation += 1;
-                let client = input.one_of(&CLIENTS);
                 let id = goal.id.clone().unwrap_or_else(|| conversation.to_string());
                 open.insert(conversation, false);
                 if executor

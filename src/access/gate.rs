@@ -63,6 +63,12 @@ impl RulesGate {
         self.is_active.store(is_active, Ordering::Release);
     }
 
+    /// Whether the agent with this name is an operator of robots (`access.operators`).
+    #[cfg(feature = "actions")]
+    pub(crate) fn is_operator(&self, agent: &str) -> bool {
+        self.access.lock().is_operator(agent)
+    }
+
     /// Reads the parts of a message with this sender in its envelope.
     fn parts_of(&self, message: &MessageView<'_>, sender: String) -> LetterParts {
         let signed = message.sender().map(|it| it.name());

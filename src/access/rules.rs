@@ -56,6 +56,8 @@ pub struct RuleError(String);
 pub(crate) struct Access {
     deny: Vec<Rule>,
     allow: Vec<Rule>,
+    /// The agents that may cancel goals of other clients, and read their results.
+    operators: Vec<Matcher>,
     /// Maximum number of letters per second and sender; `None` means unlimited.
     rate: Option<f64>,
     senders: Senders,
@@ -101,21 +103,25 @@ struct Rule {
 struct Sender(TokenBucket);
 
 impl Access {
-    /// Parses these entries, each a sender and its receivers. `rate` is the maximum number of
-    /// letters per second and sender; 0 means unlimited. Returns `None` if there is nothing to
-    /// check.
+    /// Parses these entries, each a sender and its receivers, and the patterns of operators. `rate` is the
+    /// maximum number of letters per second and sender; 0 means unlimited. Returns `None` if there is
+    /// nothing to check.
     pub(crate) fn new<'a>(
         deny: impl IntoIterator<Item = Line<'a>>,
         allow: impl IntoIterator<Item = Line<'a>>,
+        operators: &[String],
         rate: usize,
     ) -> Result<Option<Self>, RuleError> {
         let (deny, allow) = (rules(deny)?, rules(allow)?);
-        if deny.is_empty() && allow.is_empty() && rate == 0 {
+        let operators = operators.iter().map(|it| matcher(it));
+        let operators: Vec<Matcher> = operators.collect::<Result<_, _>>()?;
+        if deny.is_empty() && allow.is_empty() && operators.is_empty() && rate == 0 {
             return Ok(None);
         }
         Ok(Some(Self {
             deny,
             allow,
+            operators,
             rate: (rate > 0).then_some(rate as f64),
             senders: Senders::default(),
         }))
@@ -126,6 +132,12 @@ impl Access {
     pub(crate) fn names_actions(&self) -> bool {
         let mut rules = self.deny.iter().chain(&self.allow);
         rules.any(|rule| !rule.actions.is_empty())
+    }
+
+    /// Whether the agent with this name is an operator.
+    #[cfg(feature = "actions")]
+    pub(crate) fn is_operator(&self, agent: &str) -> bool {
+        self.operators.iter().any(|it| it.matches(agent))
     }
 
     /// Checks a letter against the rules.
@@ -250,15 +262,6 @@ fn is_over(since: Instant, now: Instant) -> bool {
 impl Rule {
     /// Parses `RECEIVER [performative=NAME,…] [protocol=NAME,…] [ontology=NAME,…] [action=NAME,…]`.
     fn parse(sender: &str, receiver: &str) -> Result<Self, RuleError> {
-        let matcher = |text: &str| {
-            Matcher::parse(text).map_err(|error| {
-                let error = error.to_string();
-                let last = error.lines().last().unwrap_or_default().trim();
-                RuleError(format!(
-                    "has {text:?}, which is not a valid pattern: {last}"
-                ))
-            })
-        };
         let mut words = receiver.split_whitespace();
         let name = words.next().unwrap_or_default();
         if name.is_empty() || sender.is_empty() {
@@ -310,6 +313,24 @@ impl Rule {
     }
 }
 
+fn matcher(text: &str) -> Result<Matcher, RuleError> {
+    Matcher::parse(text).map_err(|error| {
+        let error = error.to_string();
+        let last = error.lines().last().unwrap_or_default().trim();
+        RuleError(format!(
+            "has {text:?}, which is not a valid pattern: {last}"
+        ))
+    })
+}
+
+/// Returns the error of a pattern of operators, if it has one.
+pub(crate) fn fault_of_operator(pattern: &str) -> Option<RuleError> {
+    match pattern.is_empty() {
+        true => Some(RuleError("has an empty name".to_owned())),
+        false => matcher(pattern).err(),
+    }
+}
+
 /// Returns the first error of an entry, if it has one.
 pub(crate) fn fault((sender, receivers): Line<'_>) -> Option<RuleError> {
     if receivers.is_empty() {
@@ -347,9 +368,31 @@ mod tests {
             lines.collect()
         };
         let (deny, allow) = (owned(deny), owned(allow));
-        Access::new(lines(&deny), lines(&allow), rate)
+        Access::new(lines(&deny), lines(&allow), &[], rate)
             .unwrap()
             .unwrap()
+    }
+
+    #[cfg(feature = "actions")]
+    #[test]
+    fn operators_are_those_that_a_pattern_names() {
+        let patterns = ["boss".to_owned(), "desk_[0-9]+".to_owned()];
+        let access = Access::new([], [], &patterns, 0).unwrap().unwrap();
+        for (agent, is_operator) in [
+            ("boss", true),
+            ("desk_7", true),
+            ("boss_2", false),
+            ("desk_", false),
+            ("", false),
+        ] {
+            assert_eq!(access.is_operator(agent), is_operator, "{agent}");
+        }
+        assert_eq!(access.judge(&facts("rover", "arm")), Ok(()));
+        assert!(Access::new([], [], &[], 0).unwrap().is_none());
+        for wrong in ["", "arm_("] {
+            assert!(fault_of_operator(wrong).is_some(), "{wrong:?}");
+        }
+        assert!(!Access::default().is_operator("boss"));
     }
 
     fn facts<'a>(sender: &'a str, receiver: &'a str) -> LetterFacts<'a> {

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 use fipa_actions::{
-    ActionAnswer, ActionDescription, Ask, Failure, Goal, GoalError, GoalStatus, Json, Language,
-    LanguageError, ONTOLOGY, Refusal, Sl, language,
+    ActionAnswer, ActionDescription, Ask, Failure, Goal, GoalError, GoalRef, GoalStatus, Json,
+    Language, LanguageError, ONTOLOGY, Refusal, Sl, language,
 };
 use fipa_content::{DeserializeError, Term};
 use serde::Serialize;
@@ -140,6 +140,53 @@ impl<'a> Robot<'a> {
         })
     }
 
+    /// Returns the status of a goal, with its result if it is done and the robot still stores it: a goal of this
+    /// agent, or of another client if this agent is an operator of the robot (`access.operators`).
+    ///
+    /// # Errors
+    /// See [`actions`](Self::actions); [`Refusal::NotOperator`] of a goal of another client.
+    pub async fn status_of(&self, goal: impl Into<GoalRef>) -> Result<GoalStatus, ActionError> {
+        let ask = Ask::StatusOf(goal.into());
+        let first = match self.query(&ask).await? {
+            ActionAnswer::Status(all) => all.into_iter().next(),
+            _ => None,
+        };
+        first.ok_or(ActionError::Answer(LanguageError::Form("a status")))
+    }
+
+    /// Cancels a goal by its id, waits until it has ended, and returns its status: a goal of this agent, or of
+    /// another client if this agent is an operator of the robot (`access.operators`). The client of the goal gets
+    /// [`Failure::CancelledBy`]. A goal that was done before stays done.
+    ///
+    /// # Errors
+    /// See [`status_of`](Self::status_of).
+    pub async fn cancel(&self, goal: impl Into<GoalRef>) -> Result<GoalStatus, ActionError> {
+        let first = self.cancel_those(&Ask::Cancel(goal.into())).await?;
+        let first = first.into_iter().next();
+        first.ok_or(ActionError::Answer(LanguageError::Form("a status")))
+    }
+
+    /// Cancels all goals of an action, as [`cancel`](Self::cancel) does with one. Only an operator may do so.
+    ///
+    /// # Errors
+    /// See [`status_of`](Self::status_of).
+    pub async fn cancel_all(
+        &self,
+        action: impl Into<String>,
+    ) -> Result<Vec<GoalStatus>, ActionError> {
+        self.cancel_those(&Ask::CancelAll(action.into())).await
+    }
+
+    async fn cancel_those(&self, ask: &Ask) -> Result<Vec<GoalStatus>, ActionError> {
+        let message = self.message(Performative::Request, ask)?;
+        let request = self.agent.request(message, GRACE + self.timeout()).await?;
+        let answer = request.result().await?;
+        match read(self.language, ask, &answer)? {
+            ActionAnswer::Status(all) => Ok(all),
+            _ => Err(ActionError::Answer(LanguageError::Form("a list of goals"))),
+        }
+    }
+
     /// Creates a goal with an id of its own. `arguments` is a struct whose fields are the parameters, a
     /// map, or `()`.
     ///
@@ -259,7 +306,7 @@ impl GoalHandle<'_> {
     /// # Errors
     /// If the robot is gone, refuses, or does not answer in time.
     pub async fn progress(&self) -> Result<ProgressUpdates, ActionError> {
-        let ask = Ask::StatusOf(self.id().to_owned());
+        let ask = Ask::StatusOf(self.id().into());
         let robot = &self.robot;
         let message = robot.message(Performative::Subscribe, &ask)?;
         let subscription = robot.agent.subscribe(message, robot.timeout()).await?;

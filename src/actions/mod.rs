@@ -75,6 +75,11 @@
 //! [`Goal`](GoalHandle::goal) again: the robot runs it once, and stores the outcomes of ended goals for
 //! ten minutes, at most 128 of one client and 1,024 in all.
 //!
+//! # Operators
+//!
+//! An agent whose name matches `access.operators` of the robot may cancel the goals of other clients and read their
+//! results: [`Robot::cancel`], [`Robot::cancel_all`], [`Robot::status_of`].
+//!
 //! Not in this module: the ontology and the decisions about goals (`fipa-actions`).
 
 mod client;
@@ -84,8 +89,9 @@ pub(crate) mod table;
 
 pub use client::{ActionError, GoalHandle, ProgressUpdates, Robot, StatusUpdates};
 pub use fipa_actions::{
-    ActionDescription, Cause, Failure, Field, Goal, GoalError, GoalState, GoalStatus, ONTOLOGY,
-    OfferRefused, Orphans, ParameterDescription, Policy, Progress, Range, Refusal, Type,
+    ActionDescription, Cause, Failure, Field, Goal, GoalError, GoalRef, GoalState, GoalStatus,
+    ONTOLOGY, OfferRefused, Orphans, ParameterDescription, Policy, Progress, ProgressError, Range,
+    Refusal, Type,
 };
 pub use fipa_content::Term;
 pub use offer::{Action, Offer, OfferError};

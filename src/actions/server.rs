@@ -9,7 +9,8 @@ use fipa_actions::{
     ActionAnswer, Ask, Failure, Goal, Language, MAX_CONTENT, ONTOLOGY, Refusal, language,
 };
 
-use crate::actions::table::ActionTable;
+use crate::access::gate::RulesGate;
+use crate::actions::table::{ActionTable, Asking};
 use crate::agent::AgentCore;
 use crate::protocol::{DialogueError, Reply, Task, serve_those};
 
@@ -26,8 +27,9 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<(), DialogueError> {
         ("fipa-subscribe", Part::Subscriptions),
     ] {
         let (table, id) = (core.actions.clone(), core.endpoint.id.clone());
+        let gate = core.endpoint.domain.inner.service.gate();
         let handler = move |task: Task| {
-            let side = Side::new(table.clone(), id.clone(), &task);
+            let side = Side::new(table.clone(), id.clone(), &gate, &task);
             async move {
                 Ok::<_, Infallible>(match part {
                     Part::Goals => side.perform(task).await,
@@ -56,21 +58,30 @@ struct Side {
     table: ActionTable,
     robot: AgentId,
     client: String,
+    is_operator: bool,
     language: Option<&'static dyn Language>,
     /// The conversation id, which is the id of a goal without one.
     id: String,
 }
 
 impl Side {
-    fn new(table: ActionTable, robot: AgentId, task: &Task) -> Self {
+    fn new(table: ActionTable, robot: AgentId, gate: &RulesGate, task: &Task) -> Self {
         let message = task.message();
         let client = message.sender().map(AgentId::name).unwrap_or_default();
         Self {
             table,
             robot,
             client: client.to_owned(),
+            is_operator: gate.is_operator(client),
             language: language(message.language()),
             id: message.conversation_id().unwrap_or_default().to_owned(),
+        }
+    }
+
+    fn asking(&self) -> Asking<'_> {
+        Asking {
+            agent: &self.client,
+            is_operator: self.is_operator,
         }
     }
 
@@ -119,6 +130,7 @@ impl Side {
         }
         let mut goal = match self.ask(&task) {
             Ok(Ask::Goal(goal)) => goal,
+            Ok(ask @ (Ask::Cancel(_) | Ask::CancelAll(_))) => return self.cancel(&ask, task).await,
             Ok(_) => return self.refuse_unread(Refusal::Malformed("a query in a request".into())),
             Err(reason) => return self.refuse_unread(reason),
         };
@@ -185,6 +197,30 @@ impl Side {
         }
     }
 
+    /// Cancels goals, and waits until they have ended.
+    async fn cancel(&self, ask: &Ask, mut task: Task) -> Reply {
+        let cancelled = match ask {
+            Ask::Cancel(goal) => self.table.cancel(self.asking(), goal),
+            Ask::CancelAll(action) => self.table.cancel_all(self.asking(), action),
+            _ => return self.refuse_unread(Refusal::Malformed("a cancel".into())),
+        };
+        let receivers = match cancelled {
+            Ok(receivers) => receivers,
+            Err(reason) => return self.refuse(ask, reason),
+        };
+        let agreed = self.write(ask, &ActionAnswer::Agreed { queued: false });
+        if task.agree(agreed).await.is_err() {
+            return Reply::Nothing;
+        }
+        let mut ended = Vec::with_capacity(receivers.len());
+        for mut status in receivers {
+            // A handler that does not stop is dropped after the grace time, so each goal ends.
+            let _ = status.wait_for(|status| status.state.is_over()).await;
+            ended.push(status.borrow().clone());
+        }
+        Reply::Inform(self.write(ask, &ActionAnswer::Status(ended)).into())
+    }
+
     /// Answers a query.
     fn answer(self, task: &Task) -> Reply {
         if *task.message().performative() != Performative::QueryRef || self.language.is_none() {
@@ -197,9 +233,9 @@ impl Side {
         let answer = match &ask {
             Ask::Actions => ActionAnswer::Actions(self.table.descriptions()),
             Ask::Status => ActionAnswer::Status(self.table.status()),
-            Ask::StatusOf(id) => match self.table.status_of(&self.client, id) {
-                Some(status) => ActionAnswer::Status(vec![status]),
-                None => return self.refuse(&ask, Refusal::UnknownGoal(id.clone())),
+            Ask::StatusOf(goal) => match self.table.status_of(self.asking(), goal) {
+                Ok(status) => ActionAnswer::Status(vec![status]),
+                Err(reason) => return self.refuse(&ask, reason),
             },
             _ => return self.refuse_unread(Refusal::Malformed("a goal in a query".into())),
         };
@@ -217,9 +253,9 @@ impl Side {
             return self.refuse(&ask, Refusal::TooManyGoals);
         };
         match &ask {
-            Ask::StatusOf(id) => match self.table.watch(&self.client, id) {
-                None => self.refuse(&ask, Refusal::UnknownGoal(id.clone())),
-                Some(mut status) => {
+            Ask::StatusOf(goal) => match self.table.watch(self.asking(), goal) {
+                Err(reason) => self.refuse(&ask, reason),
+                Ok(mut status) => {
                     if task.agree("").await.is_err() {
                         return Reply::Nothing;
                     }

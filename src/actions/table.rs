@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::AgentId;
 use fipa_actions::{
-    ActionDescription, ActionLimits, Cause, Executor, Failure, Goal, GoalStatus, OfferOptions,
-    OfferRefused, Output, Progress, Refusal, Running,
+    ActionDescription, ActionLimits, Cause, Executor, Failure, Goal, GoalRef, GoalStatus,
+    OfferOptions, OfferRefused, Output, Progress, Refusal, Running,
 };
 use fipa_content::Term;
 use parking_lot::Mutex;
@@ -93,6 +93,14 @@ impl fmt::Debug for ActionTable {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("ActionTable").finish_non_exhaustive()
     }
+}
+
+/// An agent that asks for goals or cancels them.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Asking<'a> {
+    pub(crate) agent: &'a str,
+    /// Whether it is an operator of the robot.
+    pub(crate) is_operator: bool,
 }
 
 /// A goal that a client has sent.
@@ -213,26 +221,69 @@ impl ActionTable {
         state.executor.status(state.now())
     }
 
-    pub(crate) fn status_of(&self, client: &str, id: &str) -> Option<GoalStatus> {
+    /// Returns the status of a goal with its result.
+    pub(crate) fn status_of(&self, by: Asking<'_>, goal: &GoalRef) -> Result<GoalStatus, Refusal> {
         let state = self.0.state.lock();
-        let goal = state.executor.find(client, id)?;
-        state.executor.status_of(state.now(), goal)
+        let number = state.executor.find_for(by.agent, by.is_operator, goal)?;
+        let status = state.executor.status_of(state.now(), number);
+        let mut status = status.ok_or_else(|| Refusal::UnknownGoal(goal.id.clone()))?;
+        status.result = state.executor.result_of(number).cloned();
+        Ok(status)
     }
 
     /// Returns a receiver of the status of a goal.
-    pub(crate) fn watch(&self, client: &str, id: &str) -> Option<watch::Receiver<GoalStatus>> {
+    pub(crate) fn watch(
+        &self,
+        by: Asking<'_>,
+        goal: &GoalRef,
+    ) -> Result<watch::Receiver<GoalStatus>, Refusal> {
         let mut state = self.0.state.lock();
-        let goal = state.executor.find(client, id)?;
-        let status = state.executor.status_of(state.now(), goal)?;
-        if status.state.is_over() {
-            return Some(watch::Sender::new(status).subscribe());
-        }
-        let watched = state.watched.entry(goal);
-        Some(
-            watched
-                .or_insert_with(|| watch::Sender::new(status))
-                .subscribe(),
-        )
+        let number = state.executor.find_for(by.agent, by.is_operator, goal)?;
+        let watched = state.watch(number);
+        watched.ok_or_else(|| Refusal::UnknownGoal(goal.id.clone()))
+    }
+
+    /// Cancels a goal. Returns a receiver of its status.
+    pub(crate) fn cancel(
+        &self,
+        by: Asking<'_>,
+        goal: &GoalRef,
+    ) -> Result<Vec<watch::Receiver<GoalStatus>>, Refusal> {
+        self.cancel_those(by, |executor| {
+            let number = executor.find_for(by.agent, by.is_operator, goal)?;
+            Ok(vec![number])
+        })
+    }
+
+    /// Cancels all goals of an action. Returns receivers of their status.
+    pub(crate) fn cancel_all(
+        &self,
+        by: Asking<'_>,
+        action: &str,
+    ) -> Result<Vec<watch::Receiver<GoalStatus>>, Refusal> {
+        self.cancel_those(by, |executor| {
+            executor.open_of(by.agent, by.is_operator, action)
+        })
+    }
+
+    fn cancel_those(
+        &self,
+        by: Asking<'_>,
+        find: impl FnOnce(&Executor) -> Result<Vec<u64>, Refusal>,
+    ) -> Result<Vec<watch::Receiver<GoalStatus>>, Refusal> {
+        let (numbers, receivers) = {
+            let mut state = self.0.state.lock();
+            let numbers = find(&state.executor)?;
+            let receivers = numbers.iter().filter_map(|number| state.watch(*number));
+            let receivers = receivers.collect();
+            (numbers, receivers)
+        };
+        self.change(|executor, now| {
+            for number in numbers {
+                executor.cancel_by(now, by.agent, number);
+            }
+        });
+        Ok(receivers)
     }
 
     /// Returns a receiver of the number of changes of the status of goals.
@@ -362,6 +413,17 @@ impl ActionTable {
 }
 
 impl State {
+    /// Returns a receiver of the status of the goal with this number.
+    fn watch(&mut self, goal: u64) -> Option<watch::Receiver<GoalStatus>> {
+        let status = self.executor.status_of(self.now(), goal)?;
+        if status.state.is_over() {
+            return Some(watch::Sender::new(status).subscribe());
+        }
+        let watched = self.watched.entry(goal);
+        let watched = watched.or_insert_with(|| watch::Sender::new(status));
+        Some(watched.subscribe())
+    }
+
     /// Reports the status of a watched goal.
     fn report(&mut self, goal: u64, now: u64) {
         let status = self.executor.status_of(now, goal);
@@ -434,8 +496,8 @@ impl Execution {
             .change(|executor, now| executor.progress(now, goal, progress));
     }
 
-    /// Waits until the handler is to stop, and returns the cause: the client has cancelled or is gone,
-    /// the deadline has passed, or another goal takes its place. For use in `tokio::select!` beside the
+    /// Waits until the handler is to stop, and returns the cause: the client or an operator has cancelled,
+    /// the client is gone, the deadline has passed, or another goal takes its place. For use in `tokio::select!` beside the
     /// work. The handler then brings the robot into a safe state and returns an error, or a result if the
     /// action is done nevertheless. After five seconds it is dropped.
     pub async fn stopped(&self) -> Cause {

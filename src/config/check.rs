@@ -30,7 +30,7 @@ const MAX_QUEUE: usize = 65_536;
 const MONITORED: RangeInclusive<usize> = 8..=10_000_000;
 /// Bounds of `mts.queue_bytes` and of `monitor.bytes`.
 const QUEUE_BYTES: RangeInclusive<u64> = 64 << 10..=1 << 40;
-/// Maximum number of lines of each of `[routes]`, `access.allow` and `access.deny`.
+/// Maximum number of lines of each of `[routes]`, `access.allow`, `access.deny` and `access.operators`.
 const MAX_ROUTES: usize = 256;
 /// Upper bound of `access.rate`, in letters per second.
 const MAX_RATE: usize = 1_000_000;
@@ -265,6 +265,16 @@ impl Findings {
             let what = format_args!("cannot be {}", access.rate);
             let help = format!("use 0 to {MAX_RATE} letters per second");
             self.add(&["access", "rate"], what, help);
+        }
+        if access.operators.len() > MAX_ROUTES {
+            self.too_many(&["access", "operators"], access.operators.len(), MAX_ROUTES);
+        } else {
+            let mut operators = access.operators.iter();
+            let fault = operators.find_map(|it| crate::access::rules::fault_of_operator(it));
+            if let Some(fault) = fault {
+                let help = "list names or patterns of agents such as \"boss\"";
+                self.add(&["access", "operators"], fault, help);
+            }
         }
         for (name, lines) in [("allow", &access.allow), ("deny", &access.deny)] {
             if lines.len() > MAX_ROUTES {

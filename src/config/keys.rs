@@ -311,6 +311,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::Number(config.access.rate),
     },
     Key {
+        path: &["access", "operators"],
+        shape: Shape::List,
+        expected: r#"a list of names or patterns of agents such as ["boss"]"#,
+        write: |config, value| items(value, text).map(|all| config.access.operators = all),
+        read: |config| Value::list(&config.access.operators),
+    },
+    Key {
         path: &["monitor", "check"],
         shape: Shape::Text,
         expected: r#""off", "warn" or "enforce""#,

@@ -51,6 +51,7 @@
 //! rate = 0                            # letters per second of one sender; 0: no limit
 //! allow = { "rover_.*" = ["arm performative=request"] }   # all others are refused (none by default)
 //! deny = { ".*" = ["brake"] }         # takes precedence over `allow` (none by default)
+//! operators = []                      # agents that may cancel all goals of the robots of this process
 //! [monitor]
 //! check = "off"                       # or "warn", "enforce": reaction to protocol violations
 //! answer = false                      # true: violations are answered with not-understood
@@ -313,6 +314,9 @@ pub struct Access {
     pub allow: Vec<AccessRule>,
     /// `deny`: the refused letters, by sender. At most 256 lines.
     pub deny: Vec<AccessRule>,
+    /// `operators`: names or patterns of the agents that may cancel the goals of other clients, and read their
+    /// results, where this process offers actions (feature `actions`). At most 256.
+    pub operators: Vec<String>,
 }
 
 /// One line of `access.allow` or `access.deny`.
@@ -337,7 +341,7 @@ impl Access {
     pub(crate) fn rules(&self) -> Result<Option<rules::Access>, RuleError> {
         let deny = self.deny.iter().map(AccessRule::parts);
         let allow = self.allow.iter().map(AccessRule::parts);
-        rules::Access::new(deny, allow, self.rate)
+        rules::Access::new(deny, allow, &self.operators, self.rate)
     }
 }
 

@@ -322,6 +322,12 @@ impl Service {
         Reloaded { applied, later }
     }
 
+    /// Returns the access gate.
+    #[cfg(feature = "actions")]
+    pub(crate) fn gate(&self) -> Arc<RulesGate> {
+        Arc::clone(&self.gate)
+    }
+
     /// Returns the requests to read the configuration again, which `fipa reload` sends. They go to the latest caller.
     pub(crate) fn reload_requests(&self) -> ReloadRequests {
         self.watchers.reload_requests()

@@ -14,8 +14,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use fipa::actions::{
-    Action, ActionError, Execution, Failure, Goal, GoalState, OfferError, ParameterDescription,
-    Policy, Progress, Refusal, Type,
+    Action, ActionError, Execution, Failure, Goal, GoalRef, GoalState, OfferError,
+    ParameterDescription, Policy, Progress, Refusal, Term, Type,
 };
 use fipa::blocking::{Wait, on_thread};
 use fipa::protocol::DialogueError;
@@ -270,9 +270,7 @@ struct Count16 {
 
 /// Reads a goal in SL, with its fence.
 fn parsed(act: &str) -> Goal {
-    let term = fipa::actions::Term::parse(act.as_bytes())
-        .unwrap()
-        .into_owned();
+    let term = Term::parse(act.as_bytes()).unwrap().into_owned();
     let term = term.as_functional().unwrap();
     let mut goal = Goal::of(&*term.symbol, Vec::new());
     for parameter in term.parameters() {
@@ -499,6 +497,126 @@ async fn access_rules_can_name_actions() {
     let other = arm.robot(crex()).invoke("drive", &()).await.unwrap();
     other.result::<()>().await.unwrap();
     assert_eq!(runs.load(Ordering::Relaxed), 3);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_operator_cancels_goals_of_others_and_reads_their_results() {
+    let host = host();
+    let lax = Domain::open(&load(host.clone())).await.unwrap();
+    let rules = "access.operators=boss,desk_[0-9]+".to_owned();
+    let strict = load(host.iter().cloned().chain([rules]));
+    let strict = Domain::open(&strict).await.unwrap();
+    let robot = strict.register("crex").await.unwrap();
+    let at = Pose { x: 1.5, y: 0.2 };
+    let near = at.clone();
+    let drive = Action::new("drive").concurrency(8);
+    let drive = robot.offer(drive, move |(): (), run: Execution| {
+        run.progress(Progress::fraction(0.5).value(&near).unwrap());
+        forever(run)
+    });
+    let count = robot.offer(Action::new("count"), |(): (), _: Execution| async {
+        Ok::<u8, String>(7)
+    });
+    let _offers = (drive.unwrap(), count.unwrap());
+    let (rover, arm, boss) = (
+        lax.register("rover").await.unwrap(),
+        lax.register("arm").await.unwrap(),
+        lax.register("boss").await.unwrap(),
+    );
+    let is_refused = |error: &ActionError, expected: &Refusal| matches!(error, ActionError::Refused(refusal) if refusal == expected);
+    let no_operator = Refusal::NotOperator("arm".to_owned());
+    for (client, stranger, operator) in [
+        (rover.robot(crex()), arm.robot(crex()), boss.robot(crex())),
+        (
+            rover.robot(crex()).in_json(),
+            arm.robot(crex()).in_json(),
+            boss.robot(crex()).in_json(),
+        ),
+    ] {
+        let mut goal = client.invoke("drive", &()).await.unwrap();
+        let mut progress = goal.progress().await.unwrap();
+        let value = loop {
+            let status = progress.next().await.unwrap().unwrap();
+            if let Some(value) = status.progress.and_then(|it| it.value) {
+                break value;
+            }
+        };
+        assert_eq!(value.read::<Pose>().unwrap(), at);
+
+        let id = goal.id().to_owned();
+        let of_rover = GoalRef::from(&*id).of("rover");
+        for error in [
+            stranger.cancel(&*id).await.unwrap_err(),
+            stranger.cancel(of_rover.clone()).await.unwrap_err(),
+            stranger.status_of(of_rover.clone()).await.unwrap_err(),
+            stranger.cancel_all("drive").await.unwrap_err(),
+        ] {
+            assert!(is_refused(&error, &no_operator), "{error:?}");
+        }
+        let status = operator.status_of(&*id).await.unwrap();
+        assert_eq!(status.state, GoalState::Executing);
+        assert_eq!((&*status.client, &*status.action), ("rover", "drive"));
+        assert_eq!(status.progress.unwrap().value, Some(value));
+
+        let by_boss = Failure::CancelledBy("boss".to_owned());
+        let cancelled = operator.cancel(of_rover).await.unwrap();
+        assert_eq!(cancelled.state, GoalState::Failed);
+        assert_eq!(cancelled.failure.as_ref(), Some(&by_boss));
+        let told = goal.outcome().await.unwrap_err();
+        assert!(
+            matches!(&told, ActionError::Failed(failure) if *failure == by_boss),
+            "{told:?}"
+        );
+        assert_eq!(operator.cancel(&*id).await.unwrap().failure, Some(by_boss));
+        let unknown = operator.cancel("no such goal").await.unwrap_err();
+        let expected = Refusal::UnknownGoal("no such goal".to_owned());
+        assert!(is_refused(&unknown, &expected), "{unknown:?}");
+
+        let goals = [
+            client.invoke("drive", &()).await.unwrap(),
+            stranger.invoke("drive", &()).await.unwrap(),
+        ];
+        let cancelled = operator.cancel_all("drive").await.unwrap();
+        let clients: Vec<_> = cancelled.iter().map(|goal| &*goal.client).collect();
+        assert_eq!(clients, ["rover", "arm"]);
+        assert_eq!(operator.cancel_all("drive").await.unwrap(), []);
+        drop(goals);
+
+        // A client needs no rule for its own goal.
+        let goal = client.invoke("drive", &()).await.unwrap();
+        let cancelled = client.cancel(goal.id()).await.unwrap();
+        assert_eq!(cancelled.failure, Some(Failure::Cancelled));
+        let goal = client.invoke("count", &()).await.unwrap();
+        let id = goal.id().to_owned();
+        assert_eq!(goal.result::<u8>().await.unwrap(), 7);
+        for from in [&client, &operator] {
+            let done = from.status_of(&*id).await.unwrap();
+            assert_eq!(done.state, GoalState::Done);
+            assert_eq!(done.result, Some(Term::parse("7").unwrap()));
+        }
+    }
+
+    // The name in the message alone makes no operator.
+    let content = "((action (agent-identifier :name crex) (cancel-goals :action drive)))";
+    let forged = arm
+        .message(Performative::Request)
+        .sender(AgentId::new("boss").unwrap())
+        .receiver(crex())
+        .protocol("fipa-request")
+        .conversation_id("forged")
+        .ontology(fipa::actions::ONTOLOGY)
+        .content(content);
+    let goal = rover.robot(crex()).invoke("drive", &()).await.unwrap();
+    let sent = arm.send(forged).await;
+    assert!(!sent.is_ok_and(|it| it.all_succeeded()), "a forged cancel");
+    let status = boss.robot(crex()).status_of(goal.id()).await.unwrap();
+    assert_eq!(status.state, GoalState::Executing);
+
+    let reloaded = strict.reload(&load(host)).unwrap();
+    assert_eq!(reloaded.applied, ["access.operators"]);
+    let error = boss.robot(crex()).cancel(goal.id()).await.unwrap_err();
+    let expected = Refusal::NotOperator("boss".to_owned());
+    assert!(is_refused(&error, &expected), "{error:?}");
 }
 
 #[cfg(feature = "protocols")]

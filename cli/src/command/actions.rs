@@ -1,14 +1,15 @@
-//! `fipa actions`: lists the actions of robots, and the goals that they run.
+//! `fipa actions`: lists the actions of robots and the goals that they run, and cancels goals.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
 use fipa::actions::{
-    ActionDescription, ActionError, GoalStatus, ParameterDescription, Policy, Type,
+    ActionDescription, ActionError, GoalRef, GoalStatus, ParameterDescription, Policy, Refusal,
+    Term, Type,
 };
 use fipa::protocol::DialogueError;
-use fipa::{Agent, AgentId, Config};
+use fipa::{Agent, AgentId, Config, RegisterOptions};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
@@ -21,23 +22,32 @@ use crate::options::Global;
 use crate::output;
 use crate::report::Failure;
 
-/// List the actions that a robot offers, or the goals that it runs
+/// List the actions that a robot offers or the goals that it runs, show or cancel goals
 ///
 /// Without a robot, all agents of this host are asked, and those that offer actions are listed.
+///
+/// --goal, --cancel and --cancel-all are for the operators of the robot: the agents that `access.operators` of the robot's
+/// configuration names. The name of this command's agent is that of --agent. A client needs no such rule for its own
+/// goals. --cancel and --cancel-all wait until the goals have ended; their clients get the name of the operator.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa actions
   fipa actions crex
   fipa actions crex --goals
+  fipa actions crex --goal lift-17 --agent boss
+  fipa actions crex --cancel lift-17 --agent boss
+  fipa actions crex --cancel-all drive --agent boss
   fipa actions crex --json
 
 JSON:
   [ { \"robot\": name, \"actions\": [ { \"name\", \"description\", \"policy\", \"fenced\", \"result\": type,
       \"parameters\": [ { \"name\", \"type\", \"unit\", \"min\", \"max\", \"default\": value in SL,
       \"description\", \"optional\" } ] } ] } ]
-  with --goals: [ { \"robot\": name, \"goals\": [ { \"goal\", \"action\", \"client\", \"state\", \"age_ms\",
-      \"fraction\", \"note\" } ] } ]")]
+  with --goals, --goal, --cancel and --cancel-all: [ { \"robot\": name, \"goals\": [ { \"goal\", \"action\",
+      \"client\", \"state\", \"age_ms\", \"fraction\", \"note\", \"value\": value in SL or null,
+      \"result\": value in SL or null, \"failure\": text or null } ] } ]
+  \"value\" and \"result\" are null with --goals")]
 pub(crate) struct Arguments {
     /// Name of the robot [default: all agents of this host]
     #[arg(add = complete::agents())]
@@ -46,6 +56,26 @@ pub(crate) struct Arguments {
     /// List the goals that run or wait
     #[arg(long)]
     goals: bool,
+
+    /// Show the state, the progress and the result of the goal with this id
+    #[arg(long, value_name = "ID", requires = "robot", conflicts_with = "goals")]
+    goal: Option<String>,
+
+    /// Cancel the goal with this id
+    #[arg(long, value_name = "ID", requires = "robot", conflicts_with_all = ["goals", "goal"])]
+    cancel: Option<String>,
+
+    /// Cancel all goals of this action
+    #[arg(long, value_name = "ACTION", requires = "robot", conflicts_with_all = ["goals", "goal", "cancel"])]
+    cancel_all: Option<String>,
+
+    /// With --goal and --cancel: name of the client of the goal, if several clients have a goal with this id
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["goals", "cancel_all"])]
+    client: Option<AgentId>,
+
+    /// Name of the asking agent [default: a random, unused name]
+    #[arg(long, value_name = "NAME")]
+    agent: Option<AgentId>,
 
     /// Print JSON
     #[arg(long)]
@@ -56,6 +86,19 @@ pub(crate) struct Arguments {
 enum Listed {
     Actions(Vec<ActionDescription>),
     Goals(Vec<GoalStatus>),
+    /// Goals that were asked for or cancelled.
+    Named(Vec<GoalStatus>),
+}
+
+impl Arguments {
+    /// Names the goal of --goal or --cancel.
+    fn named(&self, id: &str) -> GoalRef {
+        let goal = GoalRef::from(id);
+        match &self.client {
+            Some(client) => goal.of(client.name()),
+            None => goal,
+        }
+    }
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -63,10 +106,16 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let found = membership::run(async {
         let domain = membership::join(&config).await?;
         let found = async {
-            let agent = Arc::new(asking(&domain, "actions", &config).await?);
+            let agent = Arc::new(match &arguments.agent {
+                Some(id) => {
+                    let options = RegisterOptions::default();
+                    membership::register(&domain, id.name(), options, &config).await?
+                }
+                None => asking(&domain, "actions", &config).await?,
+            });
             match &arguments.robot {
                 Some(robot) => {
-                    let listed = list(&agent, robot, arguments.goals).await;
+                    let listed = ask(&agent, robot, &arguments).await;
                     let listed = listed.map_err(|error| failed(&error, robot, &config))?;
                     Ok(vec![(robot.name().to_owned(), listed)])
                 }
@@ -83,7 +132,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 let all: Vec<Value> = all.iter().map(description).collect();
                 json!({ "robot": robot, "actions": all })
             }
-            Listed::Goals(all) => {
+            Listed::Goals(all) | Listed::Named(all) => {
                 let all: Vec<Value> = all.iter().map(status).collect();
                 json!({ "robot": robot, "goals": all })
             }
@@ -105,9 +154,29 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 }
             }
             Listed::Goals(all) => text.push_str(&goals(robot, all)),
+            Listed::Named(all) if all.is_empty() => {
+                text.push_str(&format!("{} runs no goals of this action\n", escape(robot)));
+            }
+            Listed::Named(all) => all.iter().for_each(|goal| text.push_str(&named(goal))),
         }
     }
     output::text(&text)
+}
+
+/// Asks one robot for the list, or for what the options name.
+async fn ask(agent: &Agent, robot: &AgentId, arguments: &Arguments) -> Result<Listed, ActionError> {
+    let of = agent.robot(robot.clone());
+    Ok(Listed::Named(match arguments {
+        Arguments { goal: Some(id), .. } => vec![of.status_of(arguments.named(id)).await?],
+        Arguments {
+            cancel: Some(id), ..
+        } => vec![of.cancel(arguments.named(id)).await?],
+        Arguments {
+            cancel_all: Some(action),
+            ..
+        } => of.cancel_all(action).await?,
+        _ => return list(agent, robot, arguments.goals).await,
+    }))
 }
 
 async fn list(agent: &Agent, robot: &AgentId, goals: bool) -> Result<Listed, ActionError> {
@@ -131,7 +200,22 @@ async fn all(agent: &Arc<Agent>, goals: bool) -> Vec<(String, Listed)> {
 
 /// The error report of a call about actions.
 pub(super) fn failed(error: &ActionError, robot: &AgentId, config: &Config) -> Failure {
+    let no_operator;
     let help = match error {
+        ActionError::Refused(Refusal::NotOperator(name)) => {
+            no_operator = format!(
+                "set `[access] operators = [{:?}]` in the configuration of the robot, or ask as an operator with \
+                 --agent NAME",
+                escape(name)
+            );
+            &no_operator
+        }
+        ActionError::Refused(Refusal::UnknownGoal(_)) => {
+            "`fipa actions ROBOT --goals` lists the goals that run; an ended one is stored for ten minutes"
+        }
+        ActionError::Refused(Refusal::AmbiguousGoal(_)) => {
+            "name the client with --client; `fipa actions ROBOT --goals` lists the clients"
+        }
         ActionError::Refused(_) => {
             "`fipa actions ROBOT` shows the parameters, and --goals the goals that run"
         }
@@ -234,6 +318,33 @@ fn goals(robot: &str, all: &[GoalStatus]) -> String {
     format!("{}\n", table.trim_fmt())
 }
 
+/// The lines of a goal that was asked for or cancelled.
+fn named(goal: &GoalStatus) -> String {
+    let value = |value: &Term<'_>| escape(&value.to_string()).into_owned();
+    let age = humantime::format_duration(Duration::from_millis(goal.age)).to_string();
+    let progress = goal.progress.as_ref();
+    let mut table = output::rows();
+    for (name, text) in [
+        ("goal", Some(escape(&goal.goal).into_owned())),
+        ("action", Some(escape(&goal.action).into_owned())),
+        ("client", Some(escape(&goal.client).into_owned())),
+        ("state", Some(goal.state.as_str().to_owned())),
+        ("age", Some(age)),
+        ("progress", progress.map(|_| self::progress(goal))),
+        (
+            "value",
+            progress.and_then(|it| it.value.as_ref()).map(value),
+        ),
+        ("result", goal.result.as_ref().map(value)),
+        ("failure", goal.failure.as_ref().map(ToString::to_string)),
+    ] {
+        if let Some(text) = text {
+            table.add_row([name.to_owned(), text]);
+        }
+    }
+    format!("{}\n", table.trim_fmt())
+}
+
 /// The progress of a goal in one line.
 fn progress(goal: &GoalStatus) -> String {
     let Some(progress) = &goal.progress else {
@@ -288,5 +399,8 @@ fn status(goal: &GoalStatus) -> Value {
         "age_ms": goal.age,
         "fraction": progress.and_then(|progress| progress.fraction),
         "note": progress.and_then(|progress| progress.note.as_deref()),
+        "value": progress.and_then(|progress| progress.value.as_ref()).map(ToString::to_string),
+        "result": goal.result.as_ref().map(ToString::to_string),
+        "failure": goal.failure.as_ref().map(ToString::to_string),
     })
 }

@@ -52,7 +52,7 @@ Exit codes:
 
 JSON, one object on a line:
   { \"event\": \"accepted\", \"goal\": id }
-  { \"event\": \"progress\", \"state\", \"fraction\", \"note\" }
+  { \"event\": \"progress\", \"state\", \"fraction\", \"note\", \"value\": value in SL or null }
   { \"event\": \"done\", \"result\": value in SL or null }")]
 pub(crate) struct Arguments {
     /// Name of the robot
@@ -235,19 +235,16 @@ impl Shown {
         if status.state.is_over() {
             return Ok(());
         }
-        let part = status
-            .progress
-            .as_ref()
-            .and_then(|progress| progress.fraction);
-        let note = status
-            .progress
-            .as_ref()
-            .and_then(|progress| progress.note.as_deref());
+        let progress = status.progress.as_ref();
+        let part = progress.and_then(|progress| progress.fraction);
+        let note = progress.and_then(|progress| progress.note.as_deref());
+        let value = progress.and_then(|progress| progress.value.as_ref());
+        let value = value.map(ToString::to_string);
         if self.as_json {
             let state = status.state.as_str();
-            let event =
-                json!({ "event": "progress", "state": state, "fraction": part, "note": note });
-            return output::json_line(&event);
+            return output::json_line(&json!({
+                "event": "progress", "state": state, "fraction": part, "note": note, "value": value,
+            }));
         }
         let Some(bar) = &self.bar else {
             return Ok(());
@@ -259,7 +256,9 @@ impl Shown {
         )]
         bar.set_position((part.unwrap_or_default().clamp(0.0, 1.0) * 100.0) as u64);
         let words = note.unwrap_or_else(|| status.state.as_str());
-        bar.set_message(escape(words).into_owned());
+        let words = [Some(words), value.as_deref()].into_iter().flatten();
+        let words = words.collect::<Vec<_>>().join(" ");
+        bar.set_message(escape(&words).into_owned());
         Ok(())
     }
 

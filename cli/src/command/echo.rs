@@ -5,11 +5,12 @@ use fipa::error::ErrorChain;
 use fipa::{Agent, Config, Incoming, Message, MessageBuilder, Performative};
 use fipa_acl::escape_name;
 
+use super::topics;
 use crate::answers::Answers;
 use crate::membership::{self, Receiver, Stop};
 use crate::options::{self, Global};
 use crate::output;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 
 /// Run an agent that answers each message with an inform of the same content
 ///
@@ -47,6 +48,11 @@ async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let domain = membership::join(config).await?;
     let agent = arguments.receiver.register(&domain, config).await?;
+    if let Some((publisher, topic)) = topics::of_publisher(agent.name()) {
+        report::warn(&format!(
+            "this agent answers messages; `fipa subscribe {publisher} {topic}` prints the values of a topic"
+        ));
+    }
     output::text(&format!(
         "agent {} of domain {} is ready; press Ctrl-C to stop\n",
         escape_name(agent.name()),

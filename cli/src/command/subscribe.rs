@@ -8,7 +8,8 @@ use fipa::{Agent, AgentId, Performative};
 use fipa_acl::{escape, escape_name};
 use serde_json::json;
 
-use super::request::{CANCEL_WITHIN, Opening, failed, line, unless_stopped};
+use super::request::{self, CANCEL_WITHIN, Opening, line, unless_stopped};
+use super::topics;
 use crate::complete;
 use crate::membership::Stop;
 use crate::options::{self, Global};
@@ -120,6 +121,34 @@ async fn follow(agent: &Agent, arguments: &Arguments, stop: &mut Stop) -> Result
             }
             Ok(())
         }
+    }
+}
+
+/// The error report of a subscription.
+fn failed(error: &DialogueError, name: &AgentId) -> Failure {
+    let place = || format!("{:?}", name.name());
+    match error {
+        DialogueError::Refused(message) => {
+            let content = message.content().map_or(&[][..], |content| content);
+            let reason = String::from_utf8_lossy(content);
+            Failure::failed(
+                format!("the subscription is refused: {}", escape(&reason)),
+                place(),
+                format!(
+                    "`fipa topics {}` lists the topics",
+                    escape_name(name.name())
+                ),
+            )
+        }
+        DialogueError::NotDelivered { .. }
+            if let Some((publisher, topic)) = topics::of_publisher(name.name()) =>
+        {
+            let help = format!(
+                "the agent and the topic are two arguments: `fipa subscribe {publisher} {topic}`"
+            );
+            Failure::failed(request::in_full(error), place(), help)
+        }
+        _ => request::failed(error, name),
     }
 }
 

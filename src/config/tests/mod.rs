@@ -369,6 +369,7 @@ networks = []                        # default
 
 [access]
 rate = 0                             # default
+operators = []                       # default
 
 [monitor]
 check = "off"                        # default
