@@ -342,6 +342,33 @@ mod tests {
         );
         assert_eq!(meant(&directory, "led", "c").0, ["b"]);
         assert_eq!(meant(&directory, "led", "b").0, ["b"]);
+        form(&directory, "lost", &["gone", "a"], Some("gone"));
+        let nested = Members::vacant(["a", "b"]).unwrap();
+        let mut vacant = Registration::new("vacant", Incarnation::random(), Vec::new());
+        vacant.role = Role::Coalition(nested);
+        directory.register(vacant).unwrap();
+        assert_eq!(
+            meant(&directory, "lost", "c"),
+            (vec![], vec!["lost".into()])
+        );
+        form(&directory, "outer", &["a", "vacant", "lost"], None);
+        let leaderless = vec!["vacant".to_owned(), "lost".to_owned()];
+        assert_eq!(
+            meant(&directory, "outer", "c"),
+            (vec!["a".into()], leaderless)
+        );
+        for (name, is_leaderless) in [
+            ("lost", true),
+            ("vacant", true),
+            ("outer", false),
+            ("a", false),
+        ] {
+            assert_eq!(
+                crate::is_leaderless(&directory, name),
+                is_leaderless,
+                "{name}"
+            );
+        }
         form(&directory, "alone", &["a"], None);
         assert_eq!(resolve(&directory, "alone", "a").unwrap(), Resolution::None);
         // Patterns match agents only.

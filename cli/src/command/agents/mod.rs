@@ -69,6 +69,7 @@ JSON:
   { \"domain\": text, \"gateway\": name of this host's gateway, or null,
     \"agents\": [ { \"name\", \"type\", \"description\", \"role\": \"agent\", \"gateway\" or \"coalition\",
                   \"members\": [ name ] and \"leader\": name or null, for a coalition,
+                  \"vacant\": true if it is led and has no leader at present,
                   \"reach\": \"local\" or \"remote\", \"gateway\": name and \"link\":
                   { \"encrypted\": true or false, \"certificate\": fingerprint or null } or null
                   without a connection, if remote,
@@ -431,6 +432,7 @@ impl Row {
             Role::Coalition(members) => {
                 json["members"] = json!(members.names());
                 json["leader"] = json!(members.leader());
+                json["vacant"] = json!(members.is_vacant());
                 let is_leader =
                     |name: &Arc<str>| members.leader().is_some_and(|leader| leader == name);
                 let names = members.names().iter();
@@ -461,6 +463,7 @@ impl Row {
             match &entry.role {
                 Role::Coalition(members) => match members.names().len() {
                     1 => "1 member".to_owned(),
+                    _ if members.is_vacant() => "vacant".to_owned(),
                     count => format!("{count} members"),
                 },
                 _ => state(entry, link, has_report).to_owned(),
