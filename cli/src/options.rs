@@ -1,5 +1,6 @@
 //! The command line: the options all commands share.
 
+use std::borrow::Cow;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
@@ -13,9 +14,10 @@ use fipa::Config;
 use fipa::config::{ConfigError, Effective, Sources};
 use fipa::error::ErrorChain;
 use fipa::threads;
+use fipa_acl::escape_name;
 use tokio::runtime;
 
-use crate::command::{Command, topics};
+use crate::command::Command;
 use crate::complete;
 use crate::report::{self, Failure};
 
@@ -94,7 +96,7 @@ fn with_topic(mut error: clap::Error, arguments: &[String]) -> clap::Error {
     if error.kind() == ErrorKind::MissingRequiredArgument
         && let Some(at) = arguments.iter().position(|it| it == "subscribe")
         && let Some(name) = arguments.get(at + 1)
-        && let Some((publisher, topic)) = topics::of_publisher(name)
+        && let Some((publisher, topic)) = of_publisher(name)
     {
         let tip = format!(
             "the agent and the topic are two arguments: fipa subscribe {publisher} {topic}"
@@ -103,6 +105,13 @@ fn with_topic(mut error: clap::Error, arguments: &[String]) -> clap::Error {
         error.insert(ContextKind::Suggested, tips);
     }
     error
+}
+
+/// Reads the name of an agent as the path of a topic in ROS: the agent and its topic.
+pub(crate) fn of_publisher(name: &str) -> Option<(Cow<'_, str>, Cow<'_, str>)> {
+    let (agent, topic) = name.trim_start_matches('/').split_once('/')?;
+    let is_given = !agent.is_empty() && !topic.is_empty();
+    is_given.then(|| (escape_name(agent), escape_name(topic)))
 }
 
 /// Builds the command line with its global options.

@@ -57,6 +57,7 @@ pub(crate) struct Access {
     deny: Vec<Rule>,
     allow: Vec<Rule>,
     /// The agents that may cancel goals of other clients, and read their results.
+    #[cfg(feature = "actions")]
     operators: Vec<Matcher>,
     /// Maximum number of letters per second and sender; `None` means unlimited.
     rate: Option<f64>,
@@ -121,6 +122,7 @@ impl Access {
         Ok(Some(Self {
             deny,
             allow,
+            #[cfg(feature = "actions")]
             operators,
             rate: (rate > 0).then_some(rate as f64),
             senders: Senders::default(),

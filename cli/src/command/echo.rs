@@ -5,7 +5,6 @@ use fipa::error::ErrorChain;
 use fipa::{Agent, Config, Incoming, Message, MessageBuilder, Performative};
 use fipa_acl::escape_name;
 
-use super::topics;
 use crate::answers::Answers;
 use crate::membership::{self, Receiver, Stop};
 use crate::options::{self, Global};
@@ -48,7 +47,7 @@ async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let domain = membership::join(config).await?;
     let agent = arguments.receiver.register(&domain, config).await?;
-    if let Some((publisher, topic)) = topics::of_publisher(agent.name()) {
+    if let Some((publisher, topic)) = options::of_publisher(agent.name()) {
         report::warn(&format!(
             "this agent answers messages; `fipa subscribe {publisher} {topic}` prints the values of a topic"
         ));

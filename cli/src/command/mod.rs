@@ -31,7 +31,7 @@ mod request;
 mod routes;
 mod send;
 mod subscribe;
-pub(crate) mod topics;
+mod topics;
 mod up;
 mod watch;
 

@@ -9,7 +9,6 @@ use fipa_acl::{escape, escape_name};
 use serde_json::json;
 
 use super::request::{self, CANCEL_WITHIN, Opening, line, unless_stopped};
-use super::topics;
 use crate::complete;
 use crate::membership::Stop;
 use crate::options::{self, Global};
@@ -141,7 +140,7 @@ fn failed(error: &DialogueError, name: &AgentId) -> Failure {
             )
         }
         DialogueError::NotDelivered { .. }
-            if let Some((publisher, topic)) = topics::of_publisher(name.name()) =>
+            if let Some((publisher, topic)) = options::of_publisher(name.name()) =>
         {
             let help = format!(
                 "the agent and the topic are two arguments: `fipa subscribe {publisher} {topic}`"

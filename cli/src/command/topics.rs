@@ -1,6 +1,5 @@
 //! `fipa topics`: lists the topics of agents, their rates and their subscribers.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Arc;
@@ -292,13 +291,6 @@ fn status(topic: &TopicStatus, stopped: impl Fn(&SubscriberStatus) -> Option<u32
     })
 }
 
-/// Reads the name of an agent as the path of a topic in ROS: the agent and its topic.
-pub(crate) fn of_publisher(name: &str) -> Option<(Cow<'_, str>, Cow<'_, str>)> {
-    let (agent, topic) = name.trim_start_matches('/').split_once('/')?;
-    let is_given = !agent.is_empty() && !topic.is_empty();
-    is_given.then(|| (escape_name(agent), escape_name(topic)))
-}
-
 fn failed(error: &TopicsError, agent: &AgentId, config: &Config) -> Failure {
     let problem = match error {
         TopicsError::Dialogue(error) => in_full(error),
@@ -307,7 +299,7 @@ fn failed(error: &TopicsError, agent: &AgentId, config: &Config) -> Failure {
     let as_topic;
     let help = match error {
         TopicsError::Dialogue(DialogueError::NotDelivered { .. })
-            if let Some((publisher, topic)) = of_publisher(agent.name()) =>
+            if let Some((publisher, topic)) = options::of_publisher(agent.name()) =>
         {
             as_topic = format!(
                 "the agent and the topic are two arguments: `fipa topics {publisher}` lists the topics, and \
