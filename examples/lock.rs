@@ -1,7 +1,7 @@
 //! A crane owns a docking bay, and two rovers lock it before they dock.
 //!
 //! ```console
-//! $ cargo run --example lock --features locks
+//! $ cargo run --example lock
 //! ```
 
 use std::error::Error;

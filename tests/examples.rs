@@ -88,6 +88,18 @@ fn echo() {
 }
 
 #[test]
+fn coalition() {
+    prints(
+        "coalition",
+        &[
+            "the arm obeys: (unfold)",
+            "arm: delivered…",
+            "the arm refuses (fold): the fence …",
+        ],
+    );
+}
+
+#[test]
 fn multicast() {
     prints(
         "multicast",

@@ -82,7 +82,8 @@ async fn members_lead_in_their_order_and_refuse_the_commands_of_earlier_leaders(
         there.register("crex").await.unwrap(),
         here.register("arm").await.unwrap(),
     );
-    let robot = found(&item, "robot", &["crex", "arm", "item"]).await;
+    let hand = there.register("hand").await.unwrap();
+    let robot = found(&item, "robot", &["crex", "arm", "hand", "item"]).await;
     assert!(robot.members().is_vacant());
 
     // The letter waits for the first leader.
@@ -90,6 +91,7 @@ async fn members_lead_in_their_order_and_refuse_the_commands_of_earlier_leaders(
     let sending = tokio::spawn(async move { (item.send(letter).await, item) });
     let in_arm = arm.join_coalition("robot").unwrap();
     let in_crex = crex.join_coalition("robot").unwrap();
+    let in_hand = hand.join_coalition("robot").unwrap();
     in_crex.leads().await.unwrap();
     assert_eq!(content(&crex).await, "first");
     let (sent, item) = sending.await.unwrap();
@@ -105,14 +107,16 @@ async fn members_lead_in_their_order_and_refuse_the_commands_of_earlier_leaders(
     let early = command(&in_crex, &crex, "arm");
     let late = command(&in_crex, &crex, "arm");
     in_arm.check(&early).unwrap();
-    in_arm.check(&early).unwrap();
+    in_hand.check(&early).unwrap();
+    in_hand.check(&early).unwrap();
     robot.check(&early).unwrap();
     in_crex.resign();
     in_arm.leads().await.unwrap();
     until_led(&here, "robot", Some("arm")).await;
-    // The member has no command of the next leader yet.
+    assert!(matches!(in_arm.check(&late), Err(AdmitError::Stale { .. })));
+    // This member has no command of the next leader yet.
     until_async("the late command is refused", || {
-        matches!(in_arm.check(&late), Err(AdmitError::Stale { .. }))
+        matches!(in_hand.check(&late), Err(AdmitError::Stale { .. }))
     })
     .await;
     assert!(robot.check(&late).is_err());

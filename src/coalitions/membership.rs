@@ -168,29 +168,39 @@ impl Membership {
         let fits = |known: &Admitted| owner.as_ref().is_none_or(|owner| *owner == known.owner);
         let admitted = match slot.take().filter(fits) {
             Some(admitted) => admitted,
-            None => self.admit_of(owner)?,
+            None => {
+                let missing = AdmitError::Missing {
+                    owner: owner.as_deref().unwrap_or("its founder").to_owned(),
+                    resource: self.lock.as_str().to_owned(),
+                };
+                let admitted = owner.and_then(|it| Admitted::of(&self.core, it, &self.lock).ok());
+                admitted.ok_or(missing)?
+            }
         };
         slot.insert(admitted).check(message)
-    }
-
-    /// Returns a check of the fences of this owner.
-    fn admit_of(&self, owner: Option<Arc<str>>) -> Result<Admitted, AdmitError> {
-        let missing = AdmitError::Missing {
-            owner: owner.as_deref().unwrap_or("its founder").to_owned(),
-            resource: self.lock.as_str().to_owned(),
-        };
-        let owner = owner.ok_or_else(|| missing.clone())?;
-        let device = Device::begin(&self.core, &owner, self.lock.as_str());
-        Ok(Admitted {
-            owner,
-            device: device.map_err(|_| missing)?,
-            leader: None,
-            has_ended: false,
-        })
     }
 }
 
 impl Admitted {
+    /// Begins to check the fences of this owner.
+    fn of(core: &Arc<AgentCore>, owner: Arc<str>, lock: &Resource) -> Result<Self, LockError> {
+        Ok(Self {
+            device: Device::begin(core, &owner, lock.as_str())?,
+            owner,
+            leader: None,
+            has_ended: false,
+        })
+    }
+
+    /// Admits the fence of this agent, which leads now, so that those of earlier leaders are refused.
+    fn lead(&mut self, fence: &Fence, own: &str) {
+        // The owner has just granted it, and it is higher than all others.
+        if self.device.admit(fence).is_ok() {
+            self.leader = Some(own.to_owned());
+            self.has_ended = false;
+        }
+    }
+
     fn check(&mut self, message: &Message) -> Result<Fence, AdmitError> {
         let highest = self.device.highest();
         if self.has_ended
@@ -271,7 +281,7 @@ impl Member {
                 result = or_never(request.as_mut()) => {
                     request = None;
                     match result {
-                        Ok(lock) => self.state.send_modify(|state| state.lock = Some(Arc::new(lock))),
+                        Ok(lock) => self.lead(lock),
                         Err(LockError::Closed) => return,
                         Err(_) => self.not_before = Some(Instant::now() + TURN),
                     }
@@ -341,6 +351,21 @@ impl Member {
         };
         let turn = *self.vacant_since.get_or_insert_with(Instant::now) + turn;
         Some(self.not_before.map_or(turn, |earliest| turn.max(earliest)))
+    }
+
+    /// Leads with this lock.
+    fn lead(&self, lock: Lock) {
+        if let Some(fence) = lock.fence() {
+            let mut slot = self.admitted.lock();
+            let known = slot.take().filter(|it| *it.owner == *fence.owner());
+            let begin = || Admitted::of(&self.core, fence.owner().into(), &self.lock).ok();
+            *slot = known.or_else(begin);
+            if let Some(admitted) = &mut *slot {
+                admitted.lead(fence, &self.core.endpoint.name);
+            }
+        }
+        self.state
+            .send_modify(|state| state.lock = Some(Arc::new(lock)));
     }
 
     fn release(&self) {

@@ -296,7 +296,7 @@ impl Neighbors {
     }
 
     /// Returns the gateways to greet from the current locations of this one, by name and location:
-    /// the connected ones, and those that were connected within the last [`PARTED`].
+    /// the connected ones, and those that were connected within the last [`STILL_GREETED`].
     pub(super) fn to_greet(&self, now: Instant) -> Vec<(Arc<str>, Location)> {
         let state = self.state.lock();
         let present = state.present.values().map(|neighbor| &neighbor.entry);
