@@ -69,8 +69,8 @@ async fn obey(arm: &Agent, robot: &Membership) -> Result<(), Failed> {
         return Err("no command".into());
     };
     match robot.check(command.message()) {
-        Ok(_) => println!("the arm obeys: {}", command.text()),
-        Err(refused) => println!("the arm refuses {}: {refused}", command.text()),
+        Ok(_) => println!("the arm obeys: {}", command.message().text()),
+        Err(refused) => println!("the arm refuses {}: {refused}", command.message().text()),
     }
     Ok(())
 }
