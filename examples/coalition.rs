@@ -4,6 +4,8 @@
 //! $ cargo run --example coalition
 //! ```
 
+#![expect(clippy::print_stdout, reason = "an example prints its results")]
+
 use std::error::Error;
 use std::time::Duration;
 
