@@ -44,25 +44,24 @@ struct Founded {
 impl Founded {
     /// Replaces the members with `write`, which gets the entry and the members with the holder of the lock as the
     /// leader. The grant of an agent that is no member ends. Blocks.
-    fn replace(
+    fn replace<T>(
         &self,
         entry: &mut Coalition,
         names: Vec<Arc<str>>,
-        write: impl FnOnce(&mut Coalition, Members) -> Result<(), CoalitionError>,
-    ) -> Result<(), CoalitionError> {
+        write: impl FnOnce(&mut Coalition, Members) -> Result<T, CoalitionError>,
+    ) -> Result<T, CoalitionError> {
         let holder = self.lock.status().holder;
         let is_member = |holder: &String| names.iter().any(|name| **name == **holder);
-        let leader = holder.clone().filter(is_member);
-        let no_member = holder.is_some() && leader.is_none();
-        let members = match leader {
+        let is_foreign = holder.as_ref().is_some_and(|holder| !is_member(holder));
+        let members = match holder.filter(is_member) {
             Some(leader) => Members::new(names, Some(leader.into())),
             None => Members::vacant(names),
         }?;
-        write(entry, members)?;
-        if no_member {
+        let written = write(entry, members)?;
+        if is_foreign {
             self.lock.force();
         }
-        Ok(())
+        Ok(written)
     }
 
     /// Writes the holder of the lock into the entry. Blocks.
@@ -82,8 +81,7 @@ impl Founded {
 async fn follow(runtime: Handle, founded: Arc<Founded>) {
     while founded.lock.next().await.is_some() {
         let updated = Arc::clone(&founded);
-        let updated = background::run(&runtime, move |_| updated.update()).await;
-        if let Err(error) = updated.map_err(FoundError::from).and_then(|it| Ok(it?)) {
+        if let Err(error) = blocking(&runtime, move || updated.update()).await {
             let name = founded.entry.lock().name().to_owned();
             log_limit::warn!(error = %ErrorChain(&error), coalition = name, "cannot list the leader of a coalition");
         }
@@ -100,7 +98,7 @@ impl LedCoalition {
         let members = Members::vacant(names).map_err(CoalitionError::from)?;
         let lock = Owned::begin(Arc::clone(core), lock_of(name)?, options.lock).await?;
         let (domain, name) = (core.endpoint.domain.clone(), name.to_owned());
-        let formed = blocking(core, move || {
+        let formed = blocking(runtime_of(core), move || {
             domain.form_of(&name, members, options.listing)
         });
         let formed = formed.await?;
@@ -110,7 +108,7 @@ impl LedCoalition {
     fn start(core: &Arc<AgentCore>, entry: Coalition, lock: Owned) -> Self {
         let entry = Mutex::new(entry);
         let founded = Arc::new(Founded { entry, lock });
-        let runtime = core.endpoint.domain.inner.service.runtime.clone();
+        let runtime = runtime_of(core);
         let task = runtime.spawn(follow(runtime.clone(), Arc::clone(&founded)));
         Self {
             core: Arc::clone(core),
@@ -149,7 +147,7 @@ impl LedCoalition {
     ) -> Result<(), FoundError> {
         let names = members.into_iter().map(Into::into).collect();
         let founded = Arc::clone(&self.founded);
-        blocking(&self.core, move || {
+        blocking(runtime_of(&self.core), move || {
             let mut entry = founded.entry.lock();
             founded.replace(&mut entry, names, |entry, members| {
                 entry.replace(members, Vec::new(), &[])
@@ -165,7 +163,7 @@ impl LedCoalition {
     /// If there are too many members together, or if the directory cannot be written. Both are then unchanged.
     pub async fn merge(&self, other: Self) -> Result<(), Box<(FoundError, Self)>> {
         let (ours, theirs) = (Arc::clone(&self.founded), Arc::clone(&other.founded));
-        let merged = blocking(&self.core, move || {
+        let merged = blocking(runtime_of(&self.core), move || {
             let (mut ours_entry, mut theirs) = (ours.entry.lock(), theirs.entry.lock());
             let names = ours_entry.names_with(&theirs);
             ours.replace(&mut ours_entry, names, |entry, members| {
@@ -196,16 +194,13 @@ impl LedCoalition {
         let parting: Vec<Arc<str>> = members.into_iter().map(Into::into).collect();
         let lock = Owned::begin(Arc::clone(&self.core), lock_of(name)?, options.lock).await?;
         let (founded, name) = (Arc::clone(&self.founded), name.to_owned());
-        let formed = blocking(&self.core, move || {
+        let formed = blocking(runtime_of(&self.core), move || {
             let mut entry = founded.entry.lock();
             let staying = entry.names_without(&parting)?;
             let parting = Members::vacant(parting)?;
-            let mut formed = None;
             founded.replace(&mut entry, staying, |entry, staying| {
-                formed = Some(entry.split_off(&name, parting, staying, options.listing)?);
-                Ok(())
-            })?;
-            formed.ok_or(CoalitionError::NoMember(name))
+                entry.split_off(&name, parting, staying, options.listing)
+            })
         });
         let formed = formed.await?;
         Ok(Self::start(&self.core, formed, lock))
@@ -217,7 +212,9 @@ impl LedCoalition {
     /// If the directory cannot be written.
     pub async fn dissolve(self) -> Result<(), FoundError> {
         let founded = Arc::clone(&self.founded);
-        let removed = blocking(&self.core, move || Ok(founded.entry.lock().remove()?));
+        let removed = blocking(runtime_of(&self.core), move || {
+            Ok(founded.entry.lock().remove()?)
+        });
         let removed = removed.await;
         self.end().await;
         removed
@@ -245,12 +242,15 @@ impl fmt::Debug for LedCoalition {
     }
 }
 
+fn runtime_of(core: &AgentCore) -> &Handle {
+    &core.endpoint.domain.inner.service.runtime
+}
+
 /// Runs work that blocks on a thread of its own.
 async fn blocking<T: Send + 'static>(
-    core: &AgentCore,
+    runtime: &Handle,
     work: impl FnOnce() -> Result<T, CoalitionError> + Send + 'static,
 ) -> Result<T, FoundError> {
-    let runtime = &core.endpoint.domain.inner.service.runtime;
     Ok(background::run(runtime, move |_| work()).await??)
 }
 

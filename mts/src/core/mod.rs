@@ -242,13 +242,8 @@ impl Core {
     /// as failed or unconfirmed.
     pub fn deregister(&mut self, now: Now, incarnation: Incarnation) {
         // Their sequences are those of the agent.
-        for letter in self.waiting.remove(|letter| letter.sender == incarnation) {
-            self.fail_unresolved(letter, FailureReason::Closed);
-        }
         let is_own = |letter: &Unresolved| letter.sender == incarnation;
-        for letter in self.leaderless.remove(is_own) {
-            self.fail_receivers(letter, FailureReason::Closed);
-        }
+        self.fail_waiting(is_own, FailureReason::Closed);
         if let Some(mut inbox) = self.agents.remove(&incarnation) {
             let receiver = Arc::clone(&inbox.name);
             for (stream, back) in inbox.all_waiting() {
@@ -363,17 +358,8 @@ impl Core {
             self.with_lane(now, id, |lane, table| lane.dispatch_all(now.instant, table));
         }
         self.visit_lanes(now);
-        let late = |letter: &Unresolved| letter.deadline <= now.instant;
-        if !self.waiting.is_empty() {
-            for letter in self.waiting.remove(late) {
-                self.fail_unresolved(letter, FailureReason::TimedOut);
-            }
-        }
-        if !self.leaderless.is_empty() {
-            for letter in self.leaderless.remove(late) {
-                self.fail_receivers(letter, FailureReason::TimedOut);
-            }
-        }
+        let is_late = |letter: &Unresolved| letter.deadline <= now.instant;
+        self.fail_waiting(is_late, FailureReason::TimedOut);
         self.handle_note_timers(now);
         self.static_peers
             .handle_timeout(now.instant, &mut self.table);
@@ -432,12 +418,7 @@ impl Core {
     pub fn give_up(&mut self, now: Now) {
         self.closed = true;
         self.ending = true;
-        for letter in self.waiting.remove(|_| true) {
-            self.fail_unresolved(letter, FailureReason::Closed);
-        }
-        for letter in self.leaderless.remove(|_| true) {
-            self.fail_receivers(letter, FailureReason::Closed);
-        }
+        self.fail_waiting(|_| true, FailureReason::Closed);
         for id in self.lanes_in_order() {
             if let Some(lane) = self.lanes.get_mut(&id) {
                 lane.give_up(now.instant, &mut self.table);

@@ -265,16 +265,26 @@ impl Core {
         self.send_failures(now);
     }
 
-    /// Ends a letter whose receivers were not resolved.
-    pub(super) fn fail_unresolved(&mut self, letter: Unresolved, reason: FailureReason) {
-        self.table.actions.push_back(Action::Resolved {
-            submission: letter.submission,
-            outcomes: letter.receivers.len(),
-        });
-        self.fail_receivers(letter, reason);
+    /// Ends the waiting letters for which this holds: those whose receivers were not resolved, and those that wait for a
+    /// leader.
+    pub(super) fn fail_waiting(
+        &mut self,
+        ends: impl Fn(&Unresolved) -> bool,
+        reason: FailureReason,
+    ) {
+        for letter in self.waiting.remove(&ends) {
+            self.table.actions.push_back(Action::Resolved {
+                submission: letter.submission,
+                outcomes: letter.receivers.len(),
+            });
+            self.fail_receivers(letter, reason);
+        }
+        for letter in self.leaderless.remove(&ends) {
+            self.fail_receivers(letter, reason);
+        }
     }
 
-    pub(super) fn fail_receivers(&mut self, letter: Unresolved, reason: FailureReason) {
+    fn fail_receivers(&mut self, letter: Unresolved, reason: FailureReason) {
         let Unresolved {
             submission,
             sender,

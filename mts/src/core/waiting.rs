@@ -68,6 +68,9 @@ impl WaitingLetters {
 
     /// Removes the letters for which this holds.
     pub(super) fn remove(&mut self, goes: impl Fn(&Unresolved) -> bool) -> Vec<Unresolved> {
+        if self.is_empty() {
+            return Vec::new();
+        }
         let (gone, stay) = std::mem::take(&mut self.letters)
             .into_iter()
             .partition::<VecDeque<_>, _>(|(_, letter)| goes(letter));
