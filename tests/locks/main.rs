@@ -497,9 +497,11 @@ async fn an_owner_grants_above_the_fence_of_a_device() {
         let device = gate.device("crane", "bay").unwrap();
         let ahead = "200000000000.7.00000000000000aa@crane#bay";
         let ahead: Fence = ahead.parse().unwrap();
-        device.admit(&ahead).unwrap();
+        // The grant comes first: the owner asks for higher fences when it starts, and this fence must not
+        // be among the answers.
         let lock = rover.lock("bay").await.unwrap();
         let low = lock.fence().unwrap().clone();
+        device.admit(&ahead).unwrap();
         // The live grant goes on, and the device refuses it.
         assert!(matches!(
             device.admit(&low),
