@@ -1,0 +1,119 @@
+//! Several drawings under headings.
+
+use crate::canvas::{Canvas, Font, MARGIN, WIDTH};
+use crate::text::wrapped;
+use crate::{Color, Plane, Sequence, Timeline};
+
+/// Maximum number of sections.
+const MAX_SECTIONS: usize = 60;
+/// Maximum number of lines of a text.
+const MAX_LINES: usize = 12;
+
+/// A page: drawings below each other.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Page {
+    /// Heading of the page.
+    pub title: String,
+    /// Paragraph below the heading. May be empty.
+    pub text: String,
+    /// Sections from top to bottom, at most 60.
+    pub sections: Vec<Section>,
+}
+
+/// A part of a page.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Section {
+    /// Heading.
+    pub heading: String,
+    /// Paragraph below the heading. May be empty.
+    pub text: String,
+    /// Drawing below the paragraph.
+    pub drawing: Option<Drawing>,
+}
+
+/// A drawing of a page.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Drawing {
+    /// A sequence diagram.
+    Sequence(Sequence),
+    /// A timeline.
+    Timeline(Timeline),
+    /// A plan.
+    Plane(Plane),
+}
+
+impl Section {
+    /// Creates a section with a drawing and without a paragraph.
+    pub fn new(heading: impl Into<String>, drawing: impl Into<Drawing>) -> Self {
+        Self {
+            heading: heading.into(),
+            text: String::new(),
+            drawing: Some(drawing.into()),
+        }
+    }
+}
+
+impl From<Sequence> for Drawing {
+    fn from(sequence: Sequence) -> Self {
+        Self::Sequence(sequence)
+    }
+}
+
+impl From<Timeline> for Drawing {
+    fn from(timeline: Timeline) -> Self {
+        Self::Timeline(timeline)
+    }
+}
+
+impl From<Plane> for Drawing {
+    fn from(plane: Plane) -> Self {
+        Self::Plane(plane)
+    }
+}
+
+impl Page {
+    /// Draws the page as an SVG document.
+    #[must_use]
+    pub fn svg(&self) -> String {
+        let sections = self.sections.get(..MAX_SECTIONS).unwrap_or(&self.sections);
+        let drawn = sections.iter().map(|section| match &section.drawing {
+            Some(Drawing::Sequence(sequence)) => Some(sequence.canvas()),
+            Some(Drawing::Timeline(timeline)) => Some(timeline.canvas()),
+            Some(Drawing::Plane(plane)) => Some(plane.canvas()),
+            None => None,
+        });
+        let drawn: Vec<Option<Canvas>> = drawn.collect();
+        let widths = drawn.iter().flatten().map(|canvas| canvas.width);
+        let mut out = Canvas::new(widths.fold(WIDTH, f64::max));
+        out.height = 8.0;
+        let left_out = self.sections.len() - sections.len();
+        paragraph(&mut out, Font::new(22.0).bold(), &self.title);
+        paragraph(&mut out, Font::new(14.5), &self.text);
+        for (section, canvas) in sections.iter().zip(&drawn) {
+            out.height += 16.0;
+            paragraph(&mut out, Font::new(17.5).bold(), &section.heading);
+            paragraph(&mut out, Font::new(14.0).color(Color::GRAY), &section.text);
+            if let Some(canvas) = canvas {
+                out.height += 8.0;
+                out.put((0.0, out.height), canvas);
+                out.height += canvas.height;
+            }
+        }
+        if left_out > 0 {
+            out.height += 16.0;
+            let text = format!("… {left_out} more, not drawn");
+            paragraph(&mut out, Font::new(14.0).color(Color::GRAY), &text);
+        }
+        out.height += MARGIN;
+        out.finish(&self.title)
+    }
+}
+
+/// Writes a text in as many lines as it needs.
+fn paragraph(out: &mut Canvas, font: Font, text: &str) {
+    let most = out.width - 2.0 * MARGIN;
+    for line in wrapped(text, font.size, font.bold, most, MAX_LINES) {
+        out.height += font.size * 1.4;
+        out.text((MARGIN, out.height - font.size * 0.3), font, &line);
+    }
+}
