@@ -194,11 +194,7 @@ impl Measurement {
     }
 
     /// Latency over the size of the content, as an SVG document.
-    ///
-    /// # Errors
-    ///
-    /// [`BenchError::Draw`] if the library that draws fails.
-    pub fn to_svg(&self) -> Result<String, BenchError> {
+    pub fn to_svg(&self) -> String {
         let machine = &self.machine;
         let subtitle = format!(
             "{}, {} cores, {}; others used {:.0} % of it",
@@ -207,6 +203,6 @@ impl Measurement {
             machine.system,
             machine.busy * 100.0
         );
-        plot::svg(&self.measured.rows, &subtitle).map_err(BenchError::Draw)
+        plot::svg(&self.measured.rows, &subtitle)
     }
 }

@@ -35,9 +35,6 @@ pub enum BenchError {
         /// The cause.
         what: String,
     },
-    /// A diagram could not be drawn.
-    #[error("cannot draw the diagram: {0}")]
-    Draw(String),
     /// A file could not be read.
     #[error("cannot read {}", path.display())]
     Read {

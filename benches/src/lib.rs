@@ -16,7 +16,6 @@
 //!
 //! The crate has no argument parser and prints nothing; `fipa bench` is its shell.
 
-mod bars;
 mod baseline;
 mod comparison;
 mod error;

@@ -10,9 +10,9 @@ use std::time::Instant;
 
 use fipa::{AgentId, Envelope, EnvelopeParams, Letter, Message, Payload, Performative, Time};
 use fipa_acl::{AclRepresentation, Dialect, Representation};
+use fipa_drawing::{Bar, Bars, Group};
 use serde::Serialize;
 
-use super::bars::{self, Bar, Group};
 use super::machine::Machine;
 use super::report;
 use crate::error::BenchError;
@@ -326,17 +326,16 @@ impl Paper {
     ///
     /// # Errors
     ///
-    /// If a diagram cannot be drawn or a file cannot be written.
+    /// If a file cannot be written.
     pub fn write(&self, directory: &Path) -> Result<(), BenchError> {
         let write = |name: &str, text: String| {
             let path = directory.join(name);
             let written = std::fs::write(&path, text);
             written.map_err(|source| BenchError::Write { path, source })
         };
-        let drawn = |picture: Result<String, String>| picture.map_err(BenchError::Draw);
         write("paper.md", self.to_text())?;
-        write("paper-sizes.svg", drawn(self.picture_of_sizes())?)?;
-        write("paper-times.svg", drawn(self.picture_of_times())?)
+        write("paper-sizes.svg", self.picture_of_sizes())?;
+        write("paper-times.svg", self.picture_of_times())
     }
 
     /// The tables, in Markdown.
@@ -394,7 +393,7 @@ impl Paper {
         text
     }
 
-    fn picture_of_sizes(&self) -> Result<String, String> {
+    fn picture_of_sizes(&self) -> String {
         let groups = self.sizes.iter().map(|size| Group {
             name: label(size.message, size.envelope),
             bars: vec![Bar {
@@ -404,17 +403,18 @@ impl Paper {
                 mark: size.cpp_bytes.map(|bytes| bytes as f64),
             }],
         });
-        bars::svg(&bars::Picture {
-            title: "Encoded length: 1 byte of content, 99 bytes in all other fields",
-            series: &["this library"],
-            mark: "C++, measured elsewhere",
+        let bars = Bars {
+            title: "Encoded length: 1 byte of content, 99 bytes in all other fields".to_owned(),
+            series: vec!["this library".to_owned()],
+            mark: "C++, measured elsewhere".to_owned(),
             groups: groups.collect(),
             unit: |bytes| format!("{bytes:.0} B"),
             logarithmic: false,
-        })
+        };
+        bars.svg()
     }
 
-    fn picture_of_times(&self) -> Result<String, String> {
+    fn picture_of_times(&self) -> String {
         let shown = self.times.iter().filter(|times| times.content > 1);
         let groups = shown.map(|times| {
             let bar = |series, spread: Spread, mark: Option<f64>| Bar {
@@ -440,14 +440,15 @@ impl Paper {
             "Time of encoding and decoding: mean and standard deviation of {} cycles",
             self.cycles
         );
-        bars::svg(&bars::Picture {
-            title: &title,
-            series: &["encode", "decode"],
-            mark: "C++, measured elsewhere",
+        let bars = Bars {
+            title,
+            series: vec!["encode".to_owned(), "decode".to_owned()],
+            mark: "C++, measured elsewhere".to_owned(),
             groups: groups.collect(),
             unit: super::plot::duration,
             logarithmic: true,
-        })
+        };
+        bars.svg()
     }
 }
 

@@ -218,6 +218,7 @@ fn a_conversation_is_drawn_in_the_terminal_and_for_documents() {
     let host = Host::new();
     let _arm = host.echo("arm_1");
     let file = host.path("c3.mmd");
+    let picture = host.path("c3.svg");
     let mut watching = host.start(&[
         "watch",
         "--sequence",
@@ -227,6 +228,8 @@ fn a_conversation_is_drawn_in_the_terminal_and_for_documents() {
         "2",
         "--mermaid",
         file.to_str().unwrap(),
+        "--svg",
+        picture.to_str().unwrap(),
     ]);
     assert!(watching.ready.contains("1 process;"), "{}", watching.ready);
     send(
@@ -263,6 +266,10 @@ fn a_conversation_is_drawn_in_the_terminal_and_for_documents() {
         "sequenceDiagram\n    participant p1 as rover\n    participant p2 as arm_1\n    \
          Note over p1,p2: conversation c3\n    p1->>p2: query-ref\n    p2->>p1: inform\n"
     );
+    let drawn = fs::read_to_string(&picture).unwrap();
+    for text in [">conversation c3<", ">rover<", ">arm_1<", ">query-ref<"] {
+        assert!(drawn.contains(text), "{text}: {drawn}");
+    }
 }
 
 #[test]

@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         title: "Docking of two robots".to_owned(),
         text:
             "Two rovers dock at one station. The lock of the station has one holder at a time. The \
-               program of rover_2 is killed while it holds the lock, and its lease ends."
+               program of rover_1 is killed while it holds the lock, and its lease ends."
                 .to_owned(),
         sections: vec![
             Section::new("Letters", sequence()),
@@ -178,6 +178,7 @@ fn locks() -> Timeline {
             ),
         ],
         marks: marks(),
+        until: Some(14.0),
     }
 }
 
@@ -202,6 +203,7 @@ fn coalitions() -> Timeline {
             row("rover_3", vec![interval("carry (leader)", 2.8, None, 1)]),
         ],
         marks: marks(),
+        until: Some(14.0),
     }
 }
 

@@ -511,11 +511,8 @@ fn wrapped_name(name: &str, most: f64) -> Vec<String> {
     }
     let breaks = name.char_indices().filter(|(_, c)| "@-_./: ".contains(*c));
     let fits = breaks.map(|(at, c)| if c == '@' { at } else { at + c.len_utf8() });
-    let fits = fits.filter_map(|at| name.split_at_checked(at));
-    match fits
-        .filter(|(first, _)| width(first, LABEL, true) <= most)
-        .last()
-    {
+    let mut parts = fits.filter_map(|at| name.split_at_checked(at));
+    match parts.rfind(|(first, _)| width(first, LABEL, true) <= most) {
         Some((first, rest)) if !first.is_empty() => {
             vec![first.to_owned(), fit(rest, LABEL, true, most)]
         }

@@ -101,7 +101,11 @@ fn timeline() -> impl Strategy<Value = Timeline> {
     let mark = (number(), text()).prop_map(|(at, label)| Mark { at, label });
     let rows = prop::collection::vec(row, 0..10);
     let marks = prop::collection::vec(mark, 0..10);
-    (rows, marks).prop_map(|(rows, marks)| Timeline { rows, marks })
+    (rows, marks, prop::option::of(number())).prop_map(|(rows, marks, until)| Timeline {
+        rows,
+        marks,
+        until,
+    })
 }
 
 fn plane() -> impl Strategy<Value = Plane> {
@@ -261,6 +265,7 @@ fn drawings_are_bounded() {
     let timeline = Timeline {
         rows: vec![row; 3],
         marks: (0..1_000).map(mark).collect(),
+        until: None,
     };
     let pose = |number: usize| Pose {
         x: (number as f64 / 50.0).sin(),

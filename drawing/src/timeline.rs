@@ -32,6 +32,8 @@ pub struct Timeline {
     pub rows: Vec<TimelineRow>,
     /// Instants that concern all rows, for example faults, at most 40.
     pub marks: Vec<Mark>,
+    /// End of the time axis in seconds, if it is after all intervals and marks.
+    pub until: Option<f64>,
 }
 
 /// A row of a timeline, for example an agent or a resource.
@@ -196,7 +198,7 @@ impl Timeline {
         let intervals = rows.flat_map(|row| row.intervals.iter().take(MAX_INTERVALS));
         let ends = intervals.flat_map(|it| [it.from, it.until.unwrap_or(it.from)]);
         let marks = self.marks.iter().take(MAX_MARKS).map(|mark| mark.at);
-        let (from, until) = span(ends.chain(marks)).unwrap_or((0.0, 1.0));
+        let (from, until) = span(ends.chain(marks).chain(self.until)).unwrap_or((0.0, 1.0));
         let from = if from > 0.0 && from < until / 3.0 {
             0.0
         } else {

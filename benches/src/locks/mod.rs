@@ -9,12 +9,12 @@ mod resources;
 
 use std::time::Duration;
 
+use fipa_drawing::{Bar, Bars};
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use self::group::{Group, Shape};
 use self::resources::Resources;
-use crate::bars::{self, Bar};
 use crate::baseline::{Baseline, Changes};
 use crate::comparison::Program;
 use crate::error::BenchError;
@@ -316,12 +316,8 @@ impl LocksReport {
     }
 
     /// Times of acquiring and releasing beside the letters by hand, as an SVG document.
-    ///
-    /// # Errors
-    ///
-    /// [`BenchError::Draw`] if the library that draws fails.
-    pub fn to_svg(&self) -> Result<String, BenchError> {
-        let groups = self.rows.iter().map(|row| bars::Group {
+    pub fn to_svg(&self) -> String {
+        let groups = self.rows.iter().map(|row| fipa_drawing::Group {
             name: row.name(),
             bars: vec![Bar {
                 series: 0,
@@ -330,15 +326,15 @@ impl LocksReport {
                 mark: Some(row.by_hand_us),
             }],
         });
-        let drawn = bars::svg(&bars::Picture {
-            title: "Acquire and release a resource without contention (median)",
-            series: &["lock"],
-            mark: "the same letters by hand",
+        let bars = Bars {
+            title: "Acquire and release a resource without contention (median)".to_owned(),
+            series: vec!["lock".to_owned()],
+            mark: "the same letters by hand".to_owned(),
             groups: groups.collect(),
             unit: plot::duration,
             logarithmic: true,
-        });
-        drawn.map_err(BenchError::Draw)
+        };
+        bars.svg()
     }
 }
 

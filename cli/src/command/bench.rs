@@ -207,7 +207,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 /// A result with rows that can be drawn and compared.
 struct Measured<'a> {
     notes: &'a [String],
-    svg: &'a dyn Fn() -> Result<String, BenchError>,
+    svg: &'a dyn Fn() -> String,
     compare: &'a dyn Fn(&Baseline) -> Changes,
     json: &'a dyn Fn() -> serde_json::Value,
     text: &'a dyn Fn() -> String,
@@ -223,11 +223,9 @@ fn report(
         fipa::log_limit::info!("{note}");
     }
     if let Some(file) = &arguments.svg {
-        let drawn = (measured.svg)().and_then(|picture| {
-            let path = file.clone();
-            std::fs::write(file, picture).map_err(|source| BenchError::Write { path, source })
-        });
-        drawn.map_err(failed)?;
+        let path = file.clone();
+        let written = std::fs::write(file, (measured.svg)());
+        written.map_err(|source| failed(BenchError::Write { path, source }))?;
     }
     let changes = baseline.map(|baseline| (measured.compare)(&baseline));
     if arguments.json {

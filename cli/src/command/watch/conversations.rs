@@ -139,7 +139,7 @@ impl Conversations {
     }
 
     /// All stored conversations in the order in which they began.
-    pub(super) fn all(&self) -> impl Iterator<Item = &Conversation> {
+    pub(super) fn all(&self) -> impl Iterator<Item = &Conversation> + Clone {
         self.order.values().filter_map(|id| self.by_id.get(id))
     }
 }

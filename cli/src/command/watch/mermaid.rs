@@ -2,11 +2,9 @@
 
 use std::collections::HashMap;
 use std::fmt::Write as _;
-use std::path::Path;
 
 use super::conversations::Conversation;
 use crate::output::mermaid;
-use crate::report::Failure;
 
 /// One diagram with all conversations in order.
 pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>) -> String {
@@ -54,16 +52,6 @@ pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>)
         }
     }
     text
-}
-
-pub(super) fn write(file: &Path, text: &str) -> Result<(), Failure> {
-    std::fs::write(file, text).map_err(|error| {
-        Failure::failed(
-            format!("cannot write the diagram: {error}"),
-            file.display().to_string(),
-            "give a file that this user can write",
-        )
-    })
 }
 
 #[cfg(test)]

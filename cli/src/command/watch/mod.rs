@@ -2,6 +2,7 @@
 
 pub(super) mod checker;
 mod conversations;
+mod drawing;
 mod filter;
 mod json;
 mod mermaid;
@@ -10,7 +11,7 @@ mod sequence;
 mod tally;
 mod text;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::time::{Duration, SystemTime};
 
@@ -19,7 +20,7 @@ use fipa::admin::watch::{Event, Passage, WatchOptions, Watcher};
 use fipa::{Config, Matcher, Performative};
 
 use self::checker::{CheckResult, Checker, Earlier, Letter};
-use self::conversations::Conversations;
+use self::conversations::{Conversation, Conversations};
 use self::filter::Filter;
 use self::recorder::Recorder;
 use self::tally::Tally;
@@ -53,6 +54,7 @@ Examples:
   fipa watch --violations --protocols ./protocols
   fipa watch --sequence                          draws conversations as sequence diagrams
   fipa watch --record letters.rec                 for `fipa protocol replay letters.rec`
+  fipa watch --conversation c1 --svg c1.svg      writes a drawing at the end
   fipa watch --conversation c1 --mermaid c1.mmd  writes a diagram for documents at the end
   fipa watch --json | jq -r 'select(.verdict.verdict == \"violation\") | .verdict.text'
 
@@ -113,6 +115,13 @@ pub(crate) struct Arguments {
     #[arg(long, conflicts_with = "json")]
     sequence: bool,
 
+    /// Write the conversations as sequence diagrams in SVG to this file at the end
+    ///
+    /// Repeated letters between two agents are one line with their number. A conversation has at most
+    /// 25 lines: violations and failures, then the first and the last letters.
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
+
     /// Write the conversations as a Mermaid sequence diagram to this file at the end
     #[arg(long, value_name = "FILE")]
     mermaid: Option<PathBuf>,
@@ -137,6 +146,32 @@ pub(crate) struct Arguments {
     json: bool,
 }
 
+impl Arguments {
+    /// Writes the files of diagrams.
+    fn write<'a>(
+        &self,
+        conversations: impl Iterator<Item = &'a Conversation> + Clone,
+    ) -> Result<(), Failure> {
+        if let Some(file) = &self.svg {
+            write(file, &drawing::page(conversations.clone()))?;
+        }
+        if let Some(file) = &self.mermaid {
+            write(file, &mermaid::diagram(conversations))?;
+        }
+        Ok(())
+    }
+}
+
+fn write(file: &Path, text: &str) -> Result<(), Failure> {
+    std::fs::write(file, text).map_err(|error| {
+        Failure::failed(
+            format!("cannot write the diagram: {error}"),
+            file.display().to_string(),
+            "give a file that this user can write",
+        )
+    })
+}
+
 fn bytes(text: &str) -> Result<usize, String> {
     let bytes = text.parse();
     bytes.map_err(|_| "expected a number of bytes such as 80".to_owned())
@@ -148,10 +183,8 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let directory = arguments.protocols.as_deref();
     let library = checker::protocols(&config.monitor.protocols, directory)?;
     let checker = Checker::new(library);
-    if let Some(file) = &arguments.mermaid {
-        // An unwritable file is reported at the start, not at the end.
-        mermaid::write(file, "sequenceDiagram\n")?;
-    }
+    // An unwritable file is reported at the start, not at the end.
+    arguments.write([].into_iter())?;
     let recorder = arguments.record.as_deref().map(Recorder::create);
     let recorder = recorder.transpose()?;
     options::block_on(watch(&arguments, checker, recorder, &config))?
@@ -181,8 +214,10 @@ async fn watch(
         earlier,
         recorder,
         tally: Tally::default(),
-        conversations: (arguments.sequence || arguments.mermaid.is_some())
-            .then(Conversations::default),
+        conversations: (arguments.sequence
+            || arguments.mermaid.is_some()
+            || arguments.svg.is_some())
+        .then(Conversations::default),
         format: if arguments.json {
             Format::Json
         } else if arguments.sequence {
@@ -230,7 +265,7 @@ async fn watch(
     }
     Stop::ending();
     drop(watcher);
-    display.end(arguments.mermaid.as_deref())
+    display.end(arguments)
 }
 
 /// Interval of checks for overdue messages.
@@ -381,7 +416,7 @@ impl Display<'_> {
         Ok(())
     }
 
-    fn end(mut self, mermaid: Option<&std::path::Path>) -> Result<(), Failure> {
+    fn end(mut self, arguments: &Arguments) -> Result<(), Failure> {
         if let Some(recorder) = &mut self.recorder {
             recorder.flush()?;
         }
@@ -406,9 +441,9 @@ impl Display<'_> {
                 .to_owned(),
         };
         self.print(&text)?;
-        if let (Some(file), Some(conversations)) = (mermaid, &self.conversations) {
-            mermaid::write(file, &mermaid::diagram(conversations.all()))?;
+        match &self.conversations {
+            Some(conversations) => arguments.write(conversations.all()),
+            None => Ok(()),
         }
-        Ok(())
     }
 }
