@@ -8,8 +8,8 @@ use std::error::Error;
 use std::path::Path;
 
 use fipa_drawing::{
-    Arrow, Body, Color, Interval, Mark, Note, Page, Plane, Pose, Section, Sequence, Shape, Step,
-    Timeline, TimelineRow,
+    Arrow, Automaton, Bar, Bars, Body, Color, Group, Interval, Line, Mark, Note, Page, Plane, Plot,
+    Pose, Row, Section, Sequence, Shape, State, Step, Timeline, TimelineRow,
 };
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -38,6 +38,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         ("coalitions", coalitions().svg()),
         ("plane", plane().svg()),
         ("page", page.svg()),
+        ("automaton", automaton().svg()),
+        ("plot", plot().svg()),
+        ("bars", bars().svg()),
     ] {
         std::fs::write(directory.join(format!("{name}.svg")), svg)?;
     }
@@ -233,5 +236,96 @@ fn plane() -> Plane {
             path(3, 2, |at| (3.0 + at, -0.5 + 1.2 * at * at, 1.0)),
             path(4, 3, |at| (3.4 + at, -0.9 + 1.2 * at, 0.8)),
         ],
+    }
+}
+
+fn automaton() -> Automaton {
+    let row = |text: &str, role, dashed, target| Row {
+        text: text.to_owned(),
+        role,
+        dashed,
+        target: Some(target),
+    };
+    let state = |name: &str, is_final, rows| State {
+        name: name.to_owned(),
+        is_final,
+        rows,
+    };
+    let answers = vec![
+        row("robot: agree", Some(1), true, 2),
+        row("robot: refuse", Some(1), false, 3),
+        row("after 10 s", None, true, 3),
+    ];
+    Automaton {
+        title: "docking: a robot docks at a station".to_owned(),
+        roles: vec!["station".to_owned(), "robot".to_owned()],
+        states: vec![
+            state(
+                "start",
+                false,
+                vec![row("station: request", Some(0), false, 1)],
+            ),
+            state("requested", false, answers),
+            state(
+                "agreed",
+                false,
+                vec![row("robot: inform|failure", Some(1), false, 3)],
+            ),
+            state("end", true, Vec::new()),
+        ],
+        initial: 0,
+        legend: vec!["optional: the step may be skipped".to_owned()],
+    }
+}
+
+fn micros(value: f64) -> String {
+    format!("{value} µs")
+}
+
+fn plot() -> Plot {
+    let sizes = [100.0, 1024.0, 65_536.0, 1_048_576.0];
+    let line = |name: &str, number, thin, start: f64| Line {
+        name: name.to_owned(),
+        color: Color::nth(number),
+        thin,
+        points: sizes.map(|size| (size, start + size / 4000.0)).into(),
+    };
+    Plot {
+        title: "Time of a letter".to_owned(),
+        subtitle: "A sample without measurement".to_owned(),
+        x: "content".to_owned(),
+        x_marks: sizes.map(|size| (size, format!("{size} B"))).into(),
+        unit: micros,
+        lines: vec![
+            line("agents via shm, filled, spinning", 0, false, 1.1),
+            line("raw iceoryx2", 0, true, 0.6),
+            line("agents via tcp, blocking", 1, false, 24.0),
+            line("raw tcp, blocking", 1, true, 19.0),
+        ],
+    }
+}
+
+fn bars() -> Bars {
+    let bar = |series, value| Bar {
+        series,
+        value,
+        deviation: value / 8.0,
+        mark: Some(value * 1.7),
+    };
+    let group = |name: &str, value: f64| Group {
+        name: name.to_owned(),
+        bars: vec![bar(0, value), bar(1, value * 2.0)],
+    };
+    Bars {
+        title: "Time of encoding and decoding".to_owned(),
+        series: vec!["encode".to_owned(), "decode".to_owned()],
+        mark: "another library".to_owned(),
+        groups: vec![
+            group("bit-efficient message", 1.2),
+            group("string message", 4.0),
+            group("XML message in bit-efficient envelope", 31.0),
+        ],
+        unit: micros,
+        logarithmic: true,
     }
 }

@@ -76,12 +76,14 @@ impl Bars {
         let rows = BAR * bars as f64 + GAP * groups.len() as f64;
         let bottom = TOP + rows;
         let (scale, marks) = self.scale();
-        for value in marks {
-            let x = scale.place(value);
+        for value in &marks {
+            let x = scale.place(*value);
             out.line((x, TOP - 4.0), (x, bottom), Paint::edge(Color::FAINT, 1.0));
-            let font = Font::new(12.0).anchor(Anchor::Middle);
-            out.text((x, bottom + 18.0), font, &(self.unit)(value));
         }
+        let labels = marks
+            .iter()
+            .map(|value| (scale.place(*value), (self.unit)(*value)));
+        out.labels(bottom + 18.0, 12.0, labels);
         let mut y = TOP + GAP / 2.0;
         for group in groups {
             let middle = y + BAR * group.bars.len() as f64 / 2.0;

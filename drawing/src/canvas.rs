@@ -211,6 +211,25 @@ impl Canvas {
         self.text(at, font, &fit(text, font.size, font.bold, most));
     }
 
+    /// Writes the labels of a horizontal axis below their positions, except those without room.
+    pub(crate) fn labels(
+        &mut self,
+        y: f64,
+        size: f64,
+        labels: impl Iterator<Item = (f64, String)>,
+    ) {
+        let font = Font::new(size).anchor(Anchor::Middle);
+        let mut free = 0.0;
+        for (x, text) in labels {
+            let half = width(&text, size, false) / 2.0;
+            let x = x.min(self.width - half);
+            if x - half >= free {
+                self.text((x, y), font, &text);
+                free = x + half + 6.0;
+            }
+        }
+    }
+
     /// Puts another drawing with its upper left corner at a point.
     pub(crate) fn put(&mut self, (x, y): Point, other: &Self) {
         let (x, y) = (Number(x), Number(y));

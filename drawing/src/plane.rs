@@ -179,12 +179,19 @@ impl View {
         let ((left, top), (right, bottom)) = self.corners;
         let step = round_step(80.0 / self.meter);
         let faint = Paint::edge(Color::FAINT, 1.0);
-        for value in self.x.marks_by(step) {
-            let x = self.x.place(value);
-            out.line((x, top), (x, bottom), faint);
-            let font = Font::new(SMALL).anchor(Anchor::Middle);
-            out.text((x, bottom + 18.0), font, &format!("{} m", number(value)));
+        let marks = self
+            .x
+            .marks_by(step)
+            .into_iter()
+            .map(|value| (self.x.place(value), value));
+        let marks: Vec<(f64, f64)> = marks.collect();
+        for (x, _) in &marks {
+            out.line((*x, top), (*x, bottom), faint);
         }
+        let labels = marks
+            .iter()
+            .map(|(x, value)| (*x, format!("{} m", number(*value))));
+        out.labels(bottom + 18.0, SMALL, labels);
         for value in self.y.marks_by(step) {
             let y = self.y.place(value);
             out.line((left, y), (right, y), faint);

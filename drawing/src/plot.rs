@@ -68,14 +68,16 @@ impl Plot {
         out.text_within((24.0, 36.0), Font::new(20.0), &self.title, WIDTH - 48.0);
         out.text_within((24.0, 58.0), Font::new(13.0), &self.subtitle, WIDTH - 48.0);
         let faint = Paint::edge(Color::FAINT, 1.0);
-        for (value, label) in &self.x_marks {
-            if *value >= sizes.0 && *value <= sizes.1 {
-                let at = x.place(*value);
-                out.line((at, TOP), (at, BOTTOM), faint);
-                let font = Font::new(13.0).anchor(Anchor::Middle);
-                out.text((at, BOTTOM + 18.0), font, label);
-            }
+        let shown = self
+            .x_marks
+            .iter()
+            .filter(|(value, _)| *value >= sizes.0 && *value <= sizes.1);
+        for (value, _) in shown.clone() {
+            let at = x.place(*value);
+            out.line((at, TOP), (at, BOTTOM), faint);
         }
+        let labels = shown.map(|(value, label)| (x.place(*value), label.clone()));
+        out.labels(BOTTOM + 18.0, 13.0, labels);
         for value in marks {
             let at = y.place(value);
             out.line((LEFT, at), (RIGHT, at), faint);

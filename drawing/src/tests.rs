@@ -166,7 +166,146 @@ fn unit(value: f64) -> String {
     format!("{value} <&>")
 }
 
+/// A text of a document: left, right, top and bottom edge.
+type Place = (String, [f64; 4]);
+
+/// Returns the texts of a document.
+fn places(svg: &str) -> Vec<Place> {
+    let mut reader = quick_xml::Reader::from_str(svg);
+    let mut corners: Vec<(f64, f64)> = Vec::new();
+    let mut places: Vec<Place> = Vec::new();
+    let mut is_text = false;
+    loop {
+        match reader.read_event().unwrap() {
+            Event::Start(tag) => {
+                let value = |name: &str| {
+                    let attribute = tag.try_get_attribute(name).unwrap();
+                    attribute.map_or_else(String::new, |it| it.value.into_owned())
+                };
+                let (x, y) = corners.last().copied().unwrap_or_default();
+                let moved = value("transform");
+                let moved = moved.trim_start_matches("translate(").trim_end_matches(')');
+                let number = |text: &str| text.parse::<f64>().unwrap_or_default();
+                let (right, down) = moved.split_once(' ').unwrap_or(("0", "0"));
+                corners.push((x + number(right), y + number(down)));
+                is_text = value("text-anchor") + &value("font-size") != "" && value("x") != "";
+                if is_text {
+                    let size = number(&value("font-size"));
+                    let share = match value("text-anchor").as_str() {
+                        "middle" => 0.5,
+                        "end" => 1.0,
+                        _ => 0.0,
+                    };
+                    let (x, y) = (x + number(&value("x")), y + number(&value("y")));
+                    let bold = if value("font-weight").is_empty() {
+                        0.0
+                    } else {
+                        1.0
+                    };
+                    places.push((String::new(), [x, size, share + 2.0 * bold, y]));
+                }
+            }
+            Event::End(_) => {
+                corners.pop();
+                is_text = false;
+            }
+            Event::Text(text) if is_text => {
+                if let Some((place, [left, right, top, y])) = places.last_mut() {
+                    *place = text.into_inner().into_owned();
+                    let (x, size, bold) = (*left, *right, *top >= 2.0);
+                    let length = crate::text::width(place, size, bold);
+                    *left = x - length * (*top % 2.0);
+                    *right = *left + length;
+                    *top = *y - size * 0.7;
+                    *y += size * 0.1;
+                }
+            }
+            Event::Eof => break,
+            _ => {}
+        }
+    }
+    places
+}
+
+/// Fails if two texts overlap, or if a text leaves the document.
+fn check_places(svg: &str, width: f64) {
+    let places = places(svg);
+    for (at, (text, one)) in places.iter().enumerate() {
+        assert!(
+            one[0] >= -0.2 && one[1] <= width + 0.2,
+            "{text} leaves the document: {svg}"
+        );
+        for (next, other) in &places[at + 1..] {
+            let apart = one[1] <= other[0]
+                || other[1] <= one[0]
+                || one[3] <= other[2]
+                || other[3] <= one[2];
+            assert!(apart, "{text} and {next} overlap: {svg}");
+        }
+    }
+}
+
+fn word() -> impl Strategy<Value = String> {
+    "[a-zA-Z_0-9 @.-]{1,24}"
+}
+
 proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn texts_of_sequences_do_not_overlap(
+        steps in prop::collection::vec((0..7_usize, 0..7_usize, word(), 0..6_usize), 0..40),
+        names in prop::collection::vec(word(), 7),
+    ) {
+        let step = |(at, (from, to, label, kind)): (usize, &(usize, usize, String, usize))| {
+            let (from, to) = (names[*from].clone(), names[*to].clone());
+            let time = format!("{at}.123 s");
+            match kind {
+                0 => Step::Note(Note { lane: from, text: label.clone(), time }),
+                1 => Step::Arrow(Arrow {
+                    from, to, label: label.clone(), time, violation: Some(label.repeat(20)), failed: None,
+                }),
+                _ => Step::Arrow(Arrow { from, to, label: format!("{kind}"), time, ..Arrow::default() }),
+            }
+        };
+        let sequence = Sequence { lanes: Vec::new(), steps: steps.iter().enumerate().map(step).collect() };
+        check_places(&sequence.svg(), sequence.canvas().width);
+    }
+
+    #[test]
+    fn texts_of_timelines_do_not_overlap(
+        rows in prop::collection::vec(
+            (word(), prop::collection::vec((word(), 0.0..60.0_f64, prop::option::of(0.0..20.0_f64)), 0..25)), 0..6),
+        marks in prop::collection::vec((0.0..80.0_f64, word()), 0..8),
+    ) {
+        let interval = |(label, from, time): (String, f64, Option<f64>)| {
+            Interval { label, from, until: time.map(|time| from + time), color: Color::nth(0) }
+        };
+        let row = |(name, intervals): (String, Vec<_>)| {
+            TimelineRow { name, intervals: intervals.into_iter().map(interval).collect() }
+        };
+        let timeline = Timeline {
+            rows: rows.into_iter().map(row).collect(),
+            marks: marks.into_iter().map(|(at, label)| Mark { at, label }).collect(),
+            until: None,
+        };
+        check_places(&timeline.svg(), 800.0);
+    }
+
+    #[test]
+    fn texts_of_plans_do_not_overlap(
+        bodies in prop::collection::vec((word(), 0.1..1.0_f64, prop::collection::vec((-9.0..9.0_f64, -9.0..9.0_f64), 1..9)), 0..20),
+    ) {
+        let body = |(name, radius, poses): (String, f64, Vec<(f64, f64)>)| Body {
+            name,
+            shape: Shape::Circle { radius },
+            color: Color::nth(0),
+            poses: poses.into_iter().map(|(x, y)| Pose { x, y, heading: 1.0 }).collect(),
+        };
+        let plane = Plane { bodies: bodies.into_iter().map(body).collect() };
+        check_places(&plane.svg(), 800.0);
+    }
+
     #[test]
     fn sequences_are_well_formed(drawing in sequence()) {
         check(&drawing.svg());

@@ -1,7 +1,7 @@
 //! Timelines: intervals in rows, over seconds.
 
 use crate::Color;
-use crate::canvas::{Anchor, Canvas, Font, MARGIN, Paint, WIDTH};
+use crate::canvas::{Canvas, Font, MARGIN, Paint, WIDTH};
 use crate::scale::{Scale, number, span};
 use crate::text::{fit, width, wrapped};
 
@@ -11,8 +11,8 @@ const MAX_ROWS: usize = 40;
 const MAX_INTERVALS: usize = 500;
 /// Maximum number of instants.
 const MAX_MARKS: usize = 40;
-/// Maximum number of intervals at the same time in a row that are drawn below each other.
-const MAX_LANES: usize = 6;
+/// Maximum number of intervals of a row at the same time.
+const MAX_LANES: usize = 12;
 /// Maximum number of lines for labels, of the marks and below the bars of a row.
 const MAX_LABELS: usize = 5;
 const BAR: f64 = 24.0;
@@ -41,7 +41,8 @@ pub struct Timeline {
 pub struct TimelineRow {
     /// Name at the left edge.
     pub name: String,
-    /// Intervals in any order, at most 500. Those at the same time are drawn below each other.
+    /// Intervals in any order, at most 500. Those at the same time are drawn below each other, at most 12. A line
+    /// tells how many are left out.
     pub intervals: Vec<Interval>,
 }
 
@@ -158,13 +159,15 @@ impl Timeline {
             drawn.height += 24.0;
         }
         let bottom = top + drawn.height + 4.0;
-        for value in scale.marks(8.0) {
-            let x = scale.place(value);
+        let marks = scale.marks(8.0);
+        for value in &marks {
+            let x = scale.place(*value);
             out.line((x, top), (x, bottom), Paint::edge(Color::FAINT, 1.0));
-            let text = format!("{} s", number(value));
-            let font = Font::new(SMALL).anchor(Anchor::Middle);
-            out.text((x, bottom + 18.0), font, &text);
         }
+        let seconds = marks
+            .iter()
+            .map(|value| (scale.place(*value), format!("{} s", number(*value))));
+        out.labels(bottom + 18.0, SMALL, seconds);
         out.put((0.0, top), &drawn);
         for (mark, label) in &labels {
             let x = scale.place(mark.at);
@@ -217,12 +220,20 @@ fn draw_row(
     texts: &mut Canvas,
 ) {
     let bars = bars(row, scale, right);
+    let left_out = row.intervals.len() - bars.len();
     let lanes = bars.iter().map(|bar| bar.lane + 1).max().unwrap_or(1) as f64;
     let top = out.height + GAP;
     let name = wrapped(&row.name, LABEL, true, left - MARGIN - 12.0, 2);
     for (at, line) in name.iter().enumerate() {
         let y = top + 17.0 + at as f64 * LINE;
         texts.text((MARGIN + 4.0, y), Font::new(LABEL).bold(), line);
+    }
+    let mut height = name.len() as f64 * LINE + GAP;
+    if left_out > 0 {
+        let at = (MARGIN + 4.0, top + height + 12.0);
+        let text = format!("… {left_out} more");
+        texts.text(at, Font::new(SMALL).color(Color::GRAY), &text);
+        height += LINE;
     }
     let end = top + lanes * (BAR + GAP);
     let mut lines = Lines::default();
@@ -245,7 +256,7 @@ fn draw_row(
             below(bar, y, (left, right, end), &mut lines, (out, texts));
         }
     }
-    out.height = (end + lines.height()).max(top + name.len() as f64 * LINE + GAP);
+    out.height = (end + lines.height()).max(top + height);
 }
 
 /// Writes a label into its bar, as far as it fits.
@@ -317,17 +328,12 @@ fn bars<'a>(row: &'a TimelineRow, scale: &Scale, right: f64) -> Vec<Bar<'a>> {
     let mut bars = Vec::new();
     for interval in intervals {
         let until = interval.until.unwrap_or(f64::INFINITY);
-        let free = ends.iter().position(|end| *end <= interval.from);
-        let lane = match free {
-            Some(lane) => lane,
-            None if ends.len() < MAX_LANES => {
-                ends.push(until);
-                ends.len() - 1
-            }
-            None => MAX_LANES - 1,
-        };
-        if let Some(end) = ends.get_mut(lane) {
-            *end = until.max(interval.from);
+        let lane = ends.iter().position(|end| *end <= interval.from);
+        let lane = lane.unwrap_or(ends.len());
+        match ends.get_mut(lane) {
+            Some(end) => *end = until.max(interval.from),
+            None if lane < MAX_LANES => ends.push(until),
+            None => continue,
         }
         let left = scale.place(interval.from);
         let end = interval.until.map_or(right, |until| scale.place(until));
