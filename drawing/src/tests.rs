@@ -294,7 +294,8 @@ proptest! {
 
     #[test]
     fn texts_of_plans_do_not_overlap(
-        bodies in prop::collection::vec((word(), 0.1..1.0_f64, prop::collection::vec((-9.0..9.0_f64, -9.0..9.0_f64), 1..9)), 0..20),
+        bodies in prop::collection::vec(
+            (word(), 0.1..1.0_f64, prop::collection::vec((-9.0..9.0_f64, -9.0..9.0_f64), 1..9)), 0..20),
     ) {
         let body = |(name, radius, poses): (String, f64, Vec<(f64, f64)>)| Body {
             name,
