@@ -76,28 +76,32 @@ impl Page {
     #[must_use]
     pub fn svg(&self) -> String {
         let sections = self.sections.get(..MAX_SECTIONS).unwrap_or(&self.sections);
-        let drawn = sections.iter().map(|section| match &section.drawing {
-            Some(Drawing::Sequence(sequence)) => Some(sequence.canvas()),
-            Some(Drawing::Timeline(timeline)) => Some(timeline.canvas()),
-            Some(Drawing::Plane(plane)) => Some(plane.canvas()),
-            None => None,
-        });
-        let drawn: Vec<Option<Canvas>> = drawn.collect();
-        let widths = drawn.iter().flatten().map(|canvas| canvas.width);
-        let mut out = Canvas::new(widths.fold(WIDTH, f64::max));
+        // Sequences are as wide as their lanes need, and other drawings as wide as they.
+        let sequences = sections
+            .iter()
+            .filter_map(|section| match &section.drawing {
+                Some(Drawing::Sequence(sequence)) => Some(sequence.canvas().width),
+                _ => None,
+            });
+        let wide = sequences.fold(WIDTH, f64::max);
+        let mut out = Canvas::new(wide);
         out.height = 8.0;
         let left_out = self.sections.len() - sections.len();
         paragraph(&mut out, Font::new(22.0).bold(), &self.title);
         paragraph(&mut out, Font::new(14.5), &self.text);
-        for (section, canvas) in sections.iter().zip(&drawn) {
+        for section in sections {
             out.height += 16.0;
             paragraph(&mut out, Font::new(17.5).bold(), &section.heading);
             paragraph(&mut out, Font::new(14.0).color(Color::GRAY), &section.text);
-            if let Some(canvas) = canvas {
-                out.height += 8.0;
-                out.put((0.0, out.height), canvas);
-                out.height += canvas.height;
-            }
+            let canvas = match &section.drawing {
+                Some(Drawing::Sequence(sequence)) => sequence.canvas(),
+                Some(Drawing::Timeline(timeline)) => timeline.canvas(wide),
+                Some(Drawing::Plane(plane)) => plane.canvas(wide),
+                None => continue,
+            };
+            out.height += 8.0;
+            out.put((0.0, out.height), &canvas);
+            out.height += canvas.height;
         }
         if left_out > 0 {
             out.height += 16.0;

@@ -144,7 +144,7 @@ struct View {
 }
 
 impl View {
-    fn of(bodies: &[Placed<'_>]) -> Self {
+    fn of(bodies: &[Placed<'_>], wide: f64) -> Self {
         let ends = |of: fn(&Pose) -> f64| {
             let around = bodies.iter().flat_map(move |placed| {
                 let reach = placed.body.shape.reach();
@@ -158,7 +158,7 @@ impl View {
             (from - space, until + space)
         };
         let ((left, right), (low, high)) = (ends(|pose| pose.x), ends(|pose| pose.y));
-        let (edge, wide) = (MARGIN + 50.0, WIDTH - 2.0 * MARGIN - 50.0);
+        let (edge, wide) = (MARGIN + 50.0, wide - 2.0 * MARGIN - 50.0);
         let meter = (wide / (right - left)).min(HEIGHT.1 / (high - low));
         let tall = ((high - low) * meter).max(HEIGHT.0);
         let (aside, above) = (wide / meter / 2.0, tall / meter / 2.0);
@@ -273,16 +273,16 @@ impl Plane {
     /// Draws the plan as an SVG document.
     #[must_use]
     pub fn svg(&self) -> String {
-        self.canvas().finish("Plan")
+        self.canvas(WIDTH).finish("Plan")
     }
 
-    pub(crate) fn canvas(&self) -> Canvas {
+    pub(crate) fn canvas(&self, wide: f64) -> Canvas {
         let bodies = self.bodies.iter().take(MAX_BODIES).filter_map(Placed::of);
         let mut bodies: Vec<Placed<'_>> = bodies.collect();
         // Large bodies are below small ones.
         bodies.sort_by(|a, b| b.body.shape.reach().total_cmp(&a.body.shape.reach()));
-        let view = View::of(&bodies);
-        let mut out = Canvas::new(WIDTH);
+        let view = View::of(&bodies, wide);
+        let mut out = Canvas::new(wide);
         view.axes(&mut out);
         let (moving, fixed): (Vec<&Placed<'_>>, Vec<&Placed<'_>>) =
             bodies.iter().partition(|placed| placed.moves());

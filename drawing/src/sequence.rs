@@ -2,7 +2,7 @@
 
 use crate::Color;
 use crate::canvas::{Anchor, Canvas, Font, MARGIN, Paint, Point, WIDTH};
-use crate::text::{fit, width, wrapped};
+use crate::text::{fit, name_lines, width, wrapped};
 
 /// Maximum number of lines for arrows and notes.
 const MAX_LINES: usize = 25;
@@ -475,8 +475,8 @@ impl<'a> Layout<'a> {
     /// Adds the lanes to the rows.
     fn around(&self, rows: &Canvas) -> Canvas {
         let mut all = Canvas::new(self.width);
-        let most = self.spacing - 22.0;
-        let names = self.names.iter().map(|name| wrapped_name(name, most));
+        let most = (self.spacing - 22.0).min(160.0);
+        let names = self.names.iter().map(|name| name_lines(name, LABEL, most));
         let names: Vec<Vec<String>> = names.collect();
         let lines = names.iter().map(Vec::len).max().unwrap_or(1).max(1) as f64;
         let head = 12.0 + lines * 18.0;
@@ -500,23 +500,6 @@ impl<'a> Layout<'a> {
         all.put((0.0, head + 8.0), rows);
         all.height = bottom + 2.0;
         all
-    }
-}
-
-/// Breaks the name of a lane into at most two lines.
-fn wrapped_name(name: &str, most: f64) -> Vec<String> {
-    let most = most.min(160.0);
-    if width(name, LABEL, true) <= most {
-        return vec![name.to_owned()];
-    }
-    let breaks = name.char_indices().filter(|(_, c)| "@-_./: ".contains(*c));
-    let fits = breaks.map(|(at, c)| if c == '@' { at } else { at + c.len_utf8() });
-    let mut parts = fits.filter_map(|at| name.split_at_checked(at));
-    match parts.rfind(|(first, _)| width(first, LABEL, true) <= most) {
-        Some((first, rest)) if !first.is_empty() => {
-            vec![first.to_owned(), fit(rest, LABEL, true, most)]
-        }
-        _ => vec![fit(name, LABEL, true, most)],
     }
 }
 

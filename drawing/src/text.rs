@@ -96,6 +96,22 @@ pub(crate) fn wrapped(text: &str, size: f64, bold: bool, most: f64, lines: usize
     all
 }
 
+/// Breaks a bold name into at most two lines of a maximum width, where its parts begin.
+pub(crate) fn name_lines(name: &str, size: f64, most: f64) -> Vec<String> {
+    if width(name, size, true) <= most {
+        return vec![name.to_owned()];
+    }
+    let breaks = name.char_indices().filter(|(_, c)| "@-_./: ".contains(*c));
+    let fits = breaks.map(|(at, c)| if c == '@' { at } else { at + c.len_utf8() });
+    let mut parts = fits.filter_map(|at| name.split_at_checked(at));
+    match parts.rfind(|(first, _)| width(first, size, true) <= most) {
+        Some((first, rest)) if !first.is_empty() => {
+            vec![first.to_owned(), fit(rest, size, true, most)]
+        }
+        _ => vec![fit(name, size, true, most)],
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -119,6 +135,17 @@ mod tests {
         assert_eq!(lines.len(), 2);
         assert!(lines[1].ends_with('…'), "{lines:?}");
         assert_eq!(wrapped("", 15.0, false, 120.0, 2), Vec::<String>::new());
+    }
+
+    #[test]
+    fn names_break_at_their_parts() {
+        assert_eq!(name_lines("rover", 15.0, 100.0), ["rover"]);
+        let lines = name_lines("controller@host-a.example.org", 15.0, 110.0);
+        assert_eq!(lines, ["controller", "@host-a.e…"]);
+        assert_eq!(
+            name_lines("manipulator_of_the_dock", 15.0, 110.0)[0],
+            "manipulator_"
+        );
     }
 
     #[test]

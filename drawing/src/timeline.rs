@@ -3,7 +3,7 @@
 use crate::Color;
 use crate::canvas::{Canvas, Font, MARGIN, Paint, WIDTH};
 use crate::scale::{Scale, number, span};
-use crate::text::{fit, width, wrapped};
+use crate::text::{fit, name_lines, width};
 
 /// Maximum number of rows.
 const MAX_ROWS: usize = 40;
@@ -114,17 +114,17 @@ impl Timeline {
     /// Draws the timeline as an SVG document.
     #[must_use]
     pub fn svg(&self) -> String {
-        self.canvas().finish("Timeline")
+        self.canvas(WIDTH).finish("Timeline")
     }
 
-    pub(crate) fn canvas(&self) -> Canvas {
+    pub(crate) fn canvas(&self, wide: f64) -> Canvas {
         let rows = self.rows.get(..MAX_ROWS).unwrap_or(&self.rows);
         let names = rows.iter().map(|row| width(&row.name, LABEL, true));
         let names = names.fold(0.0, f64::max).min(190.0);
         let left = MARGIN + names + 12.0;
-        let right = WIDTH - MARGIN - 8.0;
+        let right = wide - MARGIN - 8.0;
         let scale = Scale::linear(self.span(), (left, right));
-        let mut out = Canvas::new(WIDTH);
+        let mut out = Canvas::new(wide);
 
         let marks = self.marks.iter().filter(|mark| mark.at.is_finite());
         let mut marks: Vec<&Mark> = marks.take(MAX_MARKS).collect();
@@ -145,8 +145,8 @@ impl Timeline {
             .collect();
         let top = lines.height() + if marks.is_empty() { 0.0 } else { 6.0 };
 
-        let mut drawn = Canvas::new(WIDTH);
-        let mut texts = Canvas::new(WIDTH);
+        let mut drawn = Canvas::new(wide);
+        let mut texts = Canvas::new(wide);
         for row in rows {
             draw_row(row, &scale, (left, right), &mut drawn, &mut texts);
             let y = top + drawn.height;
@@ -223,7 +223,7 @@ fn draw_row(
     let left_out = row.intervals.len() - bars.len();
     let lanes = bars.iter().map(|bar| bar.lane + 1).max().unwrap_or(1) as f64;
     let top = out.height + GAP;
-    let name = wrapped(&row.name, LABEL, true, left - MARGIN - 12.0, 2);
+    let name = name_lines(&row.name, LABEL, left - MARGIN - 12.0);
     for (at, line) in name.iter().enumerate() {
         let y = top + 17.0 + at as f64 * LINE;
         texts.text((MARGIN + 4.0, y), Font::new(LABEL).bold(), line);
@@ -283,9 +283,7 @@ fn below(
         left: at,
         right: at + length,
     };
-    if space >= 0.6 * length && space > 60.0 {
-        inside(bar, y, texts);
-    } else if let Some(line) = lines.take(piece) {
+    if let Some(line) = lines.take(piece) {
         let y = end + line as f64 * LINE;
         let paint = Paint::edge(bar.interval.color, 1.2);
         let x = f64::midpoint(bar.left, bar.right).min(bar.left + 5.0);
