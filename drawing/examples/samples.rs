@@ -1,4 +1,4 @@
-//! Writes a sample of each drawing into a directory, to look at after a change:
+//! Writes samples into a directory, to look at after a change. `fipa protocol draw` draws automata.
 //!
 //! ```console
 //! $ cargo run -p fipa-drawing --example samples -- /tmp/samples
@@ -8,8 +8,8 @@ use std::error::Error;
 use std::path::Path;
 
 use fipa_drawing::{
-    Arrow, Automaton, Bar, Bars, Body, Color, Group, Interval, Line, Mark, Note, Page, Plane, Plot,
-    Pose, Row, Section, Sequence, Shape, State, Step, Timeline, TimelineRow,
+    Arrow, Bar, Bars, Body, Color, Group, Interval, Line, Mark, Note, Page, Plane, Plot, Pose,
+    Section, Sequence, Shape, Step, Timeline, TimelineRow,
 };
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -38,7 +38,6 @@ fn main() -> Result<(), Box<dyn Error>> {
         ("coalitions", coalitions().svg()),
         ("plane", plane().svg()),
         ("page", page.svg()),
-        ("automaton", automaton().svg()),
         ("plot", plot().svg()),
         ("bars", bars().svg()),
     ] {
@@ -236,45 +235,6 @@ fn plane() -> Plane {
             path(3, 2, |at| (3.0 + at, -0.5 + 1.2 * at * at, 1.0)),
             path(4, 3, |at| (3.4 + at, -0.9 + 1.2 * at, 0.8)),
         ],
-    }
-}
-
-fn automaton() -> Automaton {
-    let row = |text: &str, role, dashed, target| Row {
-        text: text.to_owned(),
-        role,
-        dashed,
-        target: Some(target),
-    };
-    let state = |name: &str, is_final, rows| State {
-        name: name.to_owned(),
-        is_final,
-        rows,
-    };
-    let answers = vec![
-        row("robot: agree", Some(1), true, 2),
-        row("robot: refuse", Some(1), false, 3),
-        row("after 10 s", None, true, 3),
-    ];
-    Automaton {
-        title: "docking: a robot docks at a station".to_owned(),
-        roles: vec!["station".to_owned(), "robot".to_owned()],
-        states: vec![
-            state(
-                "start",
-                false,
-                vec![row("station: request", Some(0), false, 1)],
-            ),
-            state("requested", false, answers),
-            state(
-                "agreed",
-                false,
-                vec![row("robot: inform|failure", Some(1), false, 3)],
-            ),
-            state("end", true, Vec::new()),
-        ],
-        initial: 0,
-        legend: vec!["optional: the step may be skipped".to_owned()],
     }
 }
 

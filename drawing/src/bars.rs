@@ -13,7 +13,7 @@ const BAR: f64 = 13.0;
 const GAP: f64 = 11.0;
 /// Maximum number of groups.
 const MAX_GROUPS: usize = 200;
-const COLORS: [Color; 2] = [Color(0x1f, 0x6f, 0xd1), Color(0x0b, 0x7a, 0x75)];
+const COLORS: [Color; 2] = [Color(0x00, 0x72, 0xb2), Color(0x6c, 0xbd, 0xeb)];
 const MARK: Color = Color(0xc9, 0x5d, 0x12);
 
 /// A diagram of bars in groups.

@@ -10,6 +10,21 @@ const MAX_SECTIONS: usize = 60;
 const MAX_LINES: usize = 12;
 
 /// A page: drawings below each other.
+///
+/// ```
+/// use fipa_drawing::{Page, Plane, Section, Sequence, Timeline};
+///
+/// let page = Page {
+///     title: "Docking".to_owned(),
+///     text: "Two rovers dock at one station.".to_owned(),
+///     sections: vec![
+///         Section::new("Letters", Sequence::default()),
+///         Section::new("Locks", Timeline::default()),
+///         Section::new("Paths", Plane::default()),
+///     ],
+/// };
+/// assert!(page.svg().contains(">Locks<"));
+/// ```
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Page {
     /// Heading of the page.
@@ -119,5 +134,42 @@ fn paragraph(out: &mut Canvas, font: Font, text: &str) {
     for line in wrapped(text, font.size, font.bold, most, MAX_LINES) {
         out.height += font.size * 1.4;
         out.text((MARGIN, out.height - font.size * 0.3), font, &line);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sections_have_headings_and_one_width() {
+        let lanes = (0..11).map(|number| format!("rover_{number}")).collect();
+        let steps = Vec::new();
+        let page = Page {
+            title: "Docking".to_owned(),
+            text: String::new(),
+            sections: vec![
+                Section::new("Locks", Timeline::default()),
+                Section::new("Letters", Sequence { lanes, steps }),
+            ],
+        };
+        let svg = page.svg();
+        let at = |text: &str| svg.find(text).unwrap();
+        assert!(at(">Docking</text>") < at(">Locks<") && at(">Locks<") < at(">Letters<"));
+        assert!(
+            svg.contains(" width=\"1264\"") && svg.contains("L1240 "),
+            "{svg}"
+        );
+    }
+
+    #[test]
+    fn sections_are_limited() {
+        let sections = vec![Section::new("Locks", Timeline::default()); 63];
+        let page = Page {
+            sections,
+            ..Page::default()
+        };
+        assert_eq!(page.svg().matches(">Locks<").count(), 60);
+        assert!(page.svg().contains(">… 3 more, not drawn<"));
     }
 }

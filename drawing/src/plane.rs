@@ -20,6 +20,21 @@ const SMALL: f64 = 13.0;
 ///
 /// A body that moves has a dashed shape where it begins, a path, and a filled shape where it ends. A line in the
 /// shape has the direction of its heading.
+///
+/// ```
+/// use fipa_drawing::{Body, Color, Plane, Pose, Shape};
+///
+/// let rover = Body {
+///     name: "rover".to_owned(),
+///     shape: Shape::Circle { radius: 0.25 },
+///     color: Color::nth(0),
+///     poses: vec![
+///         Pose { x: 0.0, y: 0.0, heading: 0.0 },
+///         Pose { x: 2.0, y: 1.0, heading: 0.5 },
+///     ],
+/// };
+/// assert!(Plane { bodies: vec![rover] }.svg().contains(">rover<"));
+/// ```
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Plane {
     /// Bodies, at most 32. Their names are beside their last poses.
@@ -420,4 +435,51 @@ fn legend(y: f64, moving: bool, out: &mut Canvas) {
     out.circle((x + 9.0, y), 8.0, Paint::edge(gray, 2.0).with(gray.light()));
     out.line((x + 9.0, y), (x + 17.0, y), Paint::edge(Color::INK, 2.2));
     out.text((x + 24.0, y + 5.0), Font::new(SMALL), "end, with heading");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_directions_have_one_scale() {
+        for (x, y) in [(10.0, 0.5), (0.5, 10.0), (3.0, 3.0)] {
+            let pose = |x, y| Pose { x, y, heading: 0.0 };
+            let body = Body {
+                poses: vec![pose(0.0, 0.0), pose(x, y)],
+                ..Body::default()
+            };
+            let placed: Vec<Placed<'_>> = Placed::of(&body).into_iter().collect();
+            let view = View::of(&placed, WIDTH);
+            let (begin, end) = (view.place(pose(0.0, 0.0)), view.place(pose(x, y)));
+            assert!(((end.0 - begin.0) / x - view.meter).abs() < 1e-6);
+            // Up in the plane is towards smaller positions in the drawing.
+            assert!(((begin.1 - end.1) / y - view.meter).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn start_and_end_are_marked() {
+        let pose = |x| Pose {
+            x,
+            ..Pose::default()
+        };
+        let moving = Body {
+            name: "rover".to_owned(),
+            poses: vec![pose(0.0), pose(1.0), pose(f64::NAN)],
+            ..Body::default()
+        };
+        let fixed = Body {
+            poses: vec![pose(3.0)],
+            ..Body::default()
+        };
+        let svg = |body: &Body| {
+            Plane {
+                bodies: vec![body.clone()],
+            }
+            .svg()
+        };
+        assert!(svg(&moving).contains("stroke-dasharray") && svg(&moving).contains(">start<"));
+        assert!(!svg(&fixed).contains("stroke-dasharray"));
+    }
 }

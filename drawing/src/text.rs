@@ -143,8 +143,8 @@ mod tests {
         let lines = name_lines("controller@host-a.example.org", 15.0, 110.0);
         assert_eq!(lines, ["controller", "@host-a.e…"]);
         assert_eq!(
-            name_lines("manipulator_of_the_dock", 15.0, 110.0)[0],
-            "manipulator_"
+            name_lines("gripper_of_the_dock", 15.0, 110.0)[0],
+            "gripper_of_"
         );
     }
 

@@ -26,6 +26,24 @@ const SMALL: f64 = 13.0;
 ///
 /// Labels that have no room in their bars are beside or below them. Viewers also show the label and times of a bar
 /// under the pointer.
+///
+/// ```
+/// use fipa_drawing::{Color, Interval, Mark, Timeline, TimelineRow};
+///
+/// let held = Interval {
+///     label: "rover #7".to_owned(),
+///     from: 1.0,
+///     until: Some(4.5),
+///     color: Color::nth(0),
+/// };
+/// let killed = Mark { at: 3.0, label: "rover killed".to_owned() };
+/// let locks = Timeline {
+///     rows: vec![TimelineRow { name: "berth".to_owned(), intervals: vec![held] }],
+///     marks: vec![killed],
+///     until: Some(10.0),
+/// };
+/// assert!(locks.svg().contains(">rover #7<"));
+/// ```
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Timeline {
     /// Rows from top to bottom, at most 40.
@@ -343,4 +361,62 @@ fn bars<'a>(row: &'a TimelineRow, scale: &Scale, right: f64) -> Vec<Bar<'a>> {
         });
     }
     bars
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn interval(label: &str, from: f64, until: Option<f64>) -> Interval {
+        Interval {
+            label: label.to_owned(),
+            from,
+            until,
+            color: Color::nth(0),
+        }
+    }
+
+    fn drawn(intervals: Vec<Interval>) -> String {
+        let name = "berth".to_owned();
+        let rows = vec![TimelineRow { name, intervals }];
+        let (marks, until) = (Vec::new(), Some(100.0));
+        Timeline { rows, marks, until }.svg()
+    }
+
+    #[test]
+    fn a_label_is_in_its_bar_else_beside_it_else_below() {
+        let svg = drawn(vec![
+            interval("inside", 0.0, Some(50.0)),
+            interval("below its bar", 60.0, Some(61.0)),
+            interval("beside", 62.0, Some(63.0)),
+        ]);
+        let y = |text: &str| {
+            let (before, _) = svg.split_once(&format!(">{text}<")).unwrap();
+            let (_, y) = before.rsplit_once(" y=\"").unwrap();
+            y.split_once('"').unwrap().0.parse::<f64>().unwrap()
+        };
+        assert_eq!(y("inside"), y("beside"));
+        assert!(y("below its bar") > y("beside"));
+    }
+
+    #[test]
+    fn intervals_at_the_same_time_are_below_each_other() {
+        let intervals = (0..20).map(|at| interval(&format!("i{at}"), f64::from(at), None));
+        let svg = drawn(intervals.collect());
+        assert_eq!(svg.matches("</g>\n<g><title>i").count(), 11, "{svg}");
+        assert!(svg.contains(">… 8 more<"), "{svg}");
+    }
+
+    #[test]
+    fn intervals_without_finite_times_are_left_out() {
+        let svg = drawn(vec![
+            interval("good", 0.0, None),
+            interval("bad", f64::NAN, None),
+            interval("endless", 0.0, Some(f64::INFINITY)),
+        ]);
+        assert!(
+            svg.contains(">good<") && svg.contains(">… 2 more<"),
+            "{svg}"
+        );
+    }
 }
