@@ -166,15 +166,22 @@ fn unit(value: f64) -> String {
     format!("{value} <&>")
 }
 
-/// A text of a document: left, right, top and bottom edge.
-type Place = (String, [f64; 4]);
+/// A text of a document with its edges.
+struct Place {
+    text: String,
+    left: f64,
+    right: f64,
+    top: f64,
+    bottom: f64,
+}
 
 /// Returns the texts of a document.
 fn places(svg: &str) -> Vec<Place> {
     let mut reader = quick_xml::Reader::from_str(svg);
     let mut corners: Vec<(f64, f64)> = Vec::new();
     let mut places: Vec<Place> = Vec::new();
-    let mut is_text = false;
+    // The text element that begins: position, font size, share of the width left of the position, and weight.
+    let mut begun = None;
     loop {
         match reader.read_event().unwrap() {
             Event::Start(tag) => {
@@ -182,42 +189,36 @@ fn places(svg: &str) -> Vec<Place> {
                     let attribute = tag.try_get_attribute(name).unwrap();
                     attribute.map_or_else(String::new, |it| it.value.into_owned())
                 };
+                let number = |text: &str| text.parse::<f64>().unwrap_or_default();
                 let (x, y) = corners.last().copied().unwrap_or_default();
                 let moved = value("transform");
                 let moved = moved.trim_start_matches("translate(").trim_end_matches(')');
-                let number = |text: &str| text.parse::<f64>().unwrap_or_default();
-                let (right, down) = moved.split_once(' ').unwrap_or(("0", "0"));
+                let (right, down) = moved.split_once(' ').unwrap_or_default();
                 corners.push((x + number(right), y + number(down)));
-                is_text = value("text-anchor") + &value("font-size") != "" && value("x") != "";
-                if is_text {
-                    let size = number(&value("font-size"));
-                    let share = match value("text-anchor").as_str() {
-                        "middle" => 0.5,
-                        "end" => 1.0,
-                        _ => 0.0,
-                    };
-                    let (x, y) = (x + number(&value("x")), y + number(&value("y")));
-                    let bold = if value("font-weight").is_empty() {
-                        0.0
-                    } else {
-                        1.0
-                    };
-                    places.push((String::new(), [x, size, share + 2.0 * bold, y]));
-                }
+                let size = number(&value("font-size"));
+                let share = match value("text-anchor").as_str() {
+                    "middle" => 0.5,
+                    "end" => 1.0,
+                    _ => 0.0,
+                };
+                let at = (x + number(&value("x")), y + number(&value("y")));
+                begun = (size > 0.0).then_some((at, size, share, value("font-weight") == "bold"));
             }
             Event::End(_) => {
                 corners.pop();
-                is_text = false;
+                begun = None;
             }
-            Event::Text(text) if is_text => {
-                if let Some((place, [left, right, top, y])) = places.last_mut() {
-                    *place = text.into_inner().into_owned();
-                    let (x, size, bold) = (*left, *right, *top >= 2.0);
-                    let length = crate::text::width(place, size, bold);
-                    *left = x - length * (*top % 2.0);
-                    *right = *left + length;
-                    *top = *y - size * 0.7;
-                    *y += size * 0.1;
+            Event::Text(text) => {
+                if let Some(((x, y), size, share, bold)) = begun {
+                    let text = text.into_inner().into_owned();
+                    let length = crate::text::width(&text, size, bold);
+                    places.push(Place {
+                        text,
+                        left: x - length * share,
+                        right: x + length * (1.0 - share),
+                        top: y - size * 0.7,
+                        bottom: y + size * 0.1,
+                    });
                 }
             }
             Event::Eof => break,
@@ -230,17 +231,15 @@ fn places(svg: &str) -> Vec<Place> {
 /// Fails if two texts overlap, or if a text leaves the document.
 fn check_places(svg: &str, width: f64) {
     let places = places(svg);
-    for (at, (text, one)) in places.iter().enumerate() {
-        assert!(
-            one[0] >= -0.2 && one[1] <= width + 0.2,
-            "{text} leaves the document: {svg}"
-        );
-        for (next, other) in &places[at + 1..] {
-            let apart = one[1] <= other[0]
-                || other[1] <= one[0]
-                || one[3] <= other[2]
-                || other[3] <= one[2];
-            assert!(apart, "{text} and {next} overlap: {svg}");
+    for (at, one) in places.iter().enumerate() {
+        let is_inside = one.left >= -0.2 && one.right <= width + 0.2;
+        assert!(is_inside, "{} leaves the document: {svg}", one.text);
+        for other in &places[at + 1..] {
+            let is_apart = one.right <= other.left
+                || other.right <= one.left
+                || one.bottom <= other.top
+                || other.bottom <= one.top;
+            assert!(is_apart, "{} and {} overlap: {svg}", one.text, other.text);
         }
     }
 }
