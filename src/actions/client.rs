@@ -240,6 +240,7 @@ impl<'a> Robot<'a> {
             goal,
             ask,
             request,
+            earlier: Vec::new(),
         })
     }
 
@@ -280,6 +281,8 @@ pub struct GoalHandle<'a> {
     goal: Goal,
     ask: Ask,
     request: Request,
+    /// Those before the host of the robot was silent. Their late answers are not for the application.
+    earlier: Vec<Request>,
 }
 
 impl GoalHandle<'_> {
@@ -329,12 +332,26 @@ impl GoalHandle<'_> {
     }
 
     /// Waits for the result as a term, `None` for an action without one. Dropping the future loses
-    /// nothing.
+    /// nothing. If the host of the robot was silent and returns, the robot is asked again: it may have failed to
+    /// deliver the result.
     ///
     /// # Errors
     /// See [`result`](Self::result).
     pub async fn outcome(&mut self) -> Result<Option<Term<'static>>, ActionError> {
-        let message = self.request.finished().await?;
+        let mut reachability = self.request.reachability();
+        let message = loop {
+            let was_silent = !reachability.unreachable().is_empty();
+            tokio::select! {
+                biased;
+                message = self.request.finished() => break message?,
+                true = reachability.changed() => {}
+            }
+            if was_silent && reachability.unreachable().is_empty() {
+                let again = self.robot.send(self.goal.clone()).await?.request;
+                reachability = again.reachability();
+                self.earlier.push(std::mem::replace(&mut self.request, again));
+            }
+        };
         match read(self.robot.language, &self.ask, &message)? {
             ActionAnswer::Done(value) => Ok(value),
             _ => Err(LanguageError::Form("a result").into()),

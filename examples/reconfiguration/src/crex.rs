@@ -1,0 +1,292 @@
+//! The program of the mobile robot: it goes where a master guides it, and leads the robot that it becomes a part of.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa::coalitions::Membership;
+use fipa::locks::Owned;
+use fipa::protocol::{PartnerEvent, PartnerWatch, Reply, Task};
+use fipa::topics::{Publisher, Topic};
+use fipa::{Agent, Domain, Message, Performative};
+use tokio::sync::Mutex;
+
+use crate::COALITION;
+use crate::face::{Contact, Face};
+use crate::fetching::{self, Way};
+use crate::geometry::Pose;
+use crate::hardware::{Hardware, Sight};
+use crate::owning::own_all;
+use crate::part::{Failed, Mutant, Part, Stop};
+use crate::report::{Claim, Reporter};
+use crate::words::{self, DOCK, Docking, Drive, IMAGES, Members, POSE};
+
+/// The pose of its interface at its body.
+const TOP: Pose = Pose::new(0.3, 0.0, 0.0);
+/// The length of an item, in meters.
+const ITEM: f64 = 0.2;
+/// Poses per second.
+const RATE: f64 = 20.0;
+/// Maximum wait for the answer of another agent.
+const TIMEOUT: Duration = Duration::from_secs(10);
+
+/// The items in front of the robot, the first one at its own interface.
+type Stack = Arc<Mutex<Vec<String>>>;
+
+struct Crex<'a> {
+    part: &'a Part,
+    agent: Agent,
+    reporter: Reporter,
+    hardware: Hardware,
+    drive: Arc<Owned>,
+    partners: PartnerWatch,
+    membership: Membership,
+    stack: Stack,
+    docking: Option<Client>,
+}
+
+/// A docking in which it is the client.
+struct Client {
+    conversation: String,
+    master: String,
+    words: Docking,
+}
+
+/// Runs the program.
+pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
+    let domain = Domain::open(&part.config()?).await?;
+    let agent = domain.register(&part.name).await?;
+    let reporter = Reporter::new(&part.name);
+    let resources = ["drive", "top"].map(|resource| format!("{}/{resource}", part.name));
+    let [drive, _top] = own_all(&agent, &resources, &reporter, &Arc::default()).await?;
+    let stack = Stack::default();
+    let poses = agent.publisher(Topic::new(POSE).rate(RATE))?;
+    let encoder = Hardware::connect(&part.world, &part.name).await?;
+    let publishing = tokio::spawn(publish(poses, encoder, Arc::clone(&stack)));
+    let membership = agent.join_coalition(COALITION)?;
+    let _fetching = fetching::offer(part, &agent, Way::InFront { part: TOP }).await?;
+    let looking = (agent.clone(), Arc::clone(&stack), reporter.clone());
+    let _server = agent.serve("fipa-request", move |task| {
+        let (agent, stack, reporter) = looking.clone();
+        async move { look(task, agent, stack, reporter).await.map_err(|error| error.to_string()) }
+    })?;
+    reporter.claim(Claim::Ready);
+
+    let mut crex = Crex {
+        part,
+        partners: agent.watch_partners(),
+        agent,
+        reporter,
+        hardware: Hardware::connect(&part.world, &part.name).await?,
+        drive,
+        membership,
+        stack,
+        docking: None,
+    };
+    let mut stop = Stop::default();
+    loop {
+        tokio::select! {
+            incoming = crex.agent.receive() => {
+                let incoming = incoming?;
+                match incoming.violation() {
+                    Some(violation) => crex.reporter.noticed(violation),
+                    None if incoming.message().protocol() == Some(DOCK) => crex.handle(incoming.message()).await?,
+                    None => {}
+                }
+            }
+            event = crex.partners.next() => crex.partner(event).await?,
+            state = crex.membership.changed() => crex.reporter.coalition(COALITION, &state?),
+            () = stop.requested() => break,
+        }
+    }
+    publishing.abort();
+    drop((crex, _server, _fetching));
+    domain.close().await;
+    Ok(())
+}
+
+/// Publishes the pose of the free interface.
+async fn publish(poses: Publisher, mut encoder: Hardware, stack: Stack) -> Result<(), Failed> {
+    let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
+    loop {
+        ticks.tick().await;
+        let front = front(&*stack.lock().await);
+        let pose = encoder.encoder().await?.then(front);
+        poses.publish(words::say(&pose)).await;
+    }
+}
+
+/// Returns the pose of the free interface at the body.
+fn front(stack: &[String]) -> Pose {
+    let items = u32::try_from(stack.len()).unwrap_or(u32::MAX);
+    TOP.then(Pose::new(ITEM * f64::from(items), 0.0, 0.0))
+}
+
+/// Looks with the camera of the last item: it is a part of the merged robot now.
+async fn look(task: Task, agent: Agent, stack: Stack, reporter: Reporter) -> Result<Reply, Failed> {
+    let Some(of) = stack.lock().await.last().cloned() else {
+        return Ok(Reply::Refuse("no item is docked".into()));
+    };
+    let _ = &task;
+    let subscribe = agent.message(Performative::Subscribe).receiver(of.as_str());
+    let mut images = agent.subscribe(subscribe.content(IMAGES), TIMEOUT).await?;
+    let image = images.next().await?;
+    images.cancel(TIMEOUT).await?;
+    let bytes = image.message().content().map_or(&[][..], |content| content);
+    let marker = Sight::find(bytes).map(|sight| sight.marker.to_string());
+    let claim = Claim::Image {
+        of,
+        bytes: bytes.len(),
+        marker,
+    };
+    reporter.claim(claim);
+    Ok(Reply::Inform(words::say(&bytes.len()).into()))
+}
+
+impl Crex<'_> {
+    async fn handle(&mut self, message: &Message) -> Result<(), Failed> {
+        let conversation = message.conversation_id().unwrap_or_default();
+        let open = self.docking.as_ref().filter(|it| it.conversation == conversation);
+        match (message.performative(), open.is_some()) {
+            (Performative::Request, false) => self.begin(message).await,
+            (Performative::Request, true) => self.drive(message).await?,
+            (Performative::Inform, true) => self.feel().await?,
+            (Performative::Failure, true) => self.tell(Performative::Failure, &message.text()).await,
+            (Performative::Cancel, _) => {
+                self.end("cancelled").await?;
+                self.answer(message, Performative::Inform, "stopped".into()).await;
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Agrees to be guided by the holder of its motors' lock.
+    async fn begin(&mut self, message: &Message) {
+        let Some(words) = words::hear::<Docking>(message) else {
+            return self.answer(message, Performative::Refuse, "expected a docking".into()).await;
+        };
+        if let Err(reason) = self.admit(message, "dock") {
+            return self.answer(message, Performative::Refuse, reason).await;
+        }
+        let master = message.sender().map(|id| id.name().to_owned()).unwrap_or_default();
+        for agent in [&master, &words.face.body] {
+            self.partners.add(agent);
+        }
+        self.docking = Some(Client {
+            conversation: message.conversation_id().unwrap_or_default().to_owned(),
+            master,
+            words,
+        });
+        self.answer(message, Performative::Agree, String::new()).await;
+    }
+
+    /// Moves its free interface at the velocity that the master wants.
+    async fn drive(&mut self, message: &Message) -> Result<(), Failed> {
+        let Some(Drive { twist }) = words::hear(message) else {
+            self.answer(message, Performative::Refuse, "expected a velocity".into()).await;
+            return Ok(());
+        };
+        if let Err(reason) = self.admit(message, "drive") {
+            self.answer(message, Performative::Refuse, reason).await;
+            return Ok(());
+        }
+        let front = front(&*self.stack.lock().await);
+        self.hardware.drive(twist.of_body(front)).await?;
+        let pose = self.hardware.encoder().await?.then(front);
+        self.answer(message, Performative::Inform, words::say(&pose)).await;
+        Ok(())
+    }
+
+    /// The item has latched: confirms if the interface feels it.
+    async fn feel(&mut self) -> Result<(), Failed> {
+        let Some(Client { words, .. }) = &self.docking else {
+            return Ok(());
+        };
+        let (face, with, words) = (words.face.clone(), words.with.clone(), words.clone());
+        let felt = match with.body == self.part.name {
+            true => self.hardware.contact(&with.side).await? == Some(face.clone()),
+            // The interface is that of an item, which its own program asks.
+            false => true,
+        };
+        self.hardware.stop().await?;
+        if !felt {
+            self.tell(Performative::Disconfirm, "the interface feels nothing").await;
+            return Ok(());
+        }
+        let contact = Contact { face, other: with };
+        self.reporter.claim(Claim::Confirmed {
+            contact: contact.clone(),
+        });
+        self.tell(Performative::Confirm, "").await;
+        self.docking = None;
+        self.joined(&words.face).await;
+        Ok(())
+    }
+
+    /// Takes the item into the stack, and asks the founder to list it.
+    async fn joined(&mut self, face: &Face) {
+        let mut stack = self.stack.lock().await;
+        stack.push(face.body.clone());
+        let [founder, _, ..] = stack.as_slice() else {
+            return;
+        };
+        let (founder, mut members) = (founder.clone(), vec![self.part.name.clone()]);
+        members.extend(stack.iter().cloned());
+        drop(stack);
+        let ask = self.agent.message(Performative::Request).receiver(founder);
+        let ask = ask.content(words::say(&Members { members }));
+        let asked = async {
+            // It leads as soon as the first item has founded the coalition.
+            tokio::time::timeout(TIMEOUT, self.membership.leads()).await??;
+            let request = self.agent.request(self.membership.guard(ask)?, TIMEOUT).await?;
+            Ok::<_, Failed>(request.result().await?)
+        };
+        if let Err(error) = asked.await {
+            self.reporter.noticed(error);
+        }
+    }
+
+    /// Ends the docking.
+    async fn end(&mut self, why: &str) -> Result<(), Failed> {
+        self.hardware.stop().await?;
+        if let Some(docking) = self.docking.take() {
+            for agent in [&docking.master, &docking.words.face.body] {
+                self.partners.remove(agent);
+            }
+            self.reporter.noticed(format!("the docking has ended: {why}"));
+        }
+        Ok(())
+    }
+
+    async fn partner(&mut self, event: PartnerEvent) -> Result<(), Failed> {
+        match event {
+            PartnerEvent::Gone { agent } => self.end(&format!("{agent} is gone")).await?,
+            PartnerEvent::Unreachable { agent, .. } => self.reporter.noticed(format!("{agent} is unreachable")),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn admit(&self, message: &Message, action: &str) -> Result<(), String> {
+        if self.part.has(Mutant::FencesUnchecked) {
+            return Ok(());
+        }
+        let resource = self.drive.resource();
+        self.reporter.admission(action, resource, self.drive.check(message))
+    }
+
+    /// Tells the master of the docking.
+    async fn tell(&self, act: Performative, content: &str) {
+        let Some(docking) = &self.docking else {
+            return;
+        };
+        let tell = self.agent.message(act).receiver(docking.master.as_str());
+        let tell = tell.protocol(DOCK).conversation_id(&docking.conversation);
+        self.reporter.send(&self.agent, tell.content(content.to_owned())).await;
+    }
+
+    async fn answer(&self, message: &Message, act: Performative, content: String) {
+        let answer = self.agent.reply(message, act).content(content);
+        self.reporter.send(&self.agent, answer).await;
+    }
+}

@@ -1,0 +1,408 @@
+//! The launcher: it starts the processes, causes the fault, and collects the reports. It decides nothing.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::io::Write as _;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::time::Duration;
+
+use rustix::process::{Pid, Signal, kill_process};
+use tempfile::TempDir;
+use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
+use tokio::process::{Child, ChildStdin, Command};
+use tokio::sync::mpsc;
+use tokio::time::{Instant, timeout_at};
+
+use crate::part::{Failed, Mutant, Part, Role};
+pub use crate::relay::Link;
+use crate::relay::Relay;
+use crate::report::{Claim, Report, now};
+use crate::{Fault, PROTOCOL};
+
+/// Maximum time for a process to start or end.
+const STEP: Duration = Duration::from_secs(20);
+/// Maximum time of a run.
+const RUN: Duration = Duration::from_secs(90);
+/// Duration of the cut of the link.
+const CUT: Duration = Duration::from_secs(10);
+/// Duration of the stop of the master, longer than the lease.
+const PAUSE: Duration = Duration::from_secs(6);
+
+/// The hosts, each with its agents.
+const HOSTS: [(&str, &[(&str, Role)]); 2] = [
+    ("sherpa", &[("sherpa", Role::Sherpa), ("payload_1", Role::Item), ("payload_2", Role::Item)]),
+    ("crex", &[("crex", Role::Crex), ("operator", Role::Operator)]),
+];
+
+/// The options of a run.
+#[derive(Debug, Clone, Default)]
+#[expect(clippy::exhaustive_structs, reason = "the caller writes each field")]
+pub struct Options {
+    /// The fault.
+    pub fault: Option<Fault>,
+    /// The seed of the world.
+    pub seed: u64,
+    /// The link between the hosts.
+    pub link: Link,
+    /// A defect that is built in.
+    pub mutant: Option<Mutant>,
+    /// The program that runs a [`Part`], and its arguments before the part.
+    pub program: Vec<OsString>,
+    /// The program of the items, if it is another one.
+    pub item: Option<Vec<OsString>>,
+}
+
+/// The result of a run.
+#[derive(Debug)]
+#[non_exhaustive]
+pub struct Outcome {
+    /// All reports, in the order of their times.
+    pub reports: Vec<Report>,
+    /// The claims that the checker found to be true.
+    pub passed: Vec<String>,
+    /// Those that are not.
+    pub failed: Vec<String>,
+}
+
+struct Process {
+    child: Child,
+    /// Dropping it asks the process to end.
+    orders: Option<ChildStdin>,
+}
+
+struct Run<'a> {
+    options: &'a Options,
+    dir: TempDir,
+    processes: BTreeMap<String, Process>,
+    sender: mpsc::UnboundedSender<Report>,
+    reports: mpsc::UnboundedReceiver<Report>,
+    recording: std::fs::File,
+    all: Vec<Report>,
+    relay: Option<Relay>,
+}
+
+/// Runs the application once. `show` gets each report when it arrives.
+///
+/// # Errors
+/// If a process cannot be started, or does not end.
+pub async fn run(options: &Options, show: &mut dyn FnMut(&Report)) -> Result<Outcome, Failed> {
+    // Private and with a random name: another user cannot create it first.
+    let dir = tempfile::Builder::new()
+        .prefix("fipa-dock-")
+        .permissions(std::fs::Permissions::from_mode(0o700))
+        .tempdir()?;
+    let (sender, reports) = mpsc::unbounded_channel();
+    let mut run = Run {
+        options,
+        recording: std::fs::File::create(dir.path().join("recording.json"))?,
+        dir,
+        processes: BTreeMap::new(),
+        sender,
+        reports,
+        all: Vec::new(),
+        relay: None,
+    };
+    let ran = run.scenario(show).await;
+    let ended = run.end(show).await;
+    ran?;
+    ended?;
+    let mut reports = run.all;
+    reports.sort_by_key(|report| report.at);
+    let (passed, failed) = reports.iter().rev().find_map(|report| match &report.claim {
+        Claim::Checked { passed, failed } => Some((passed.clone(), failed.clone())),
+        _ => None,
+    }).ok_or("the checker has not reported")?;
+    Ok(Outcome {
+        reports,
+        passed,
+        failed,
+    })
+}
+
+impl Run<'_> {
+    async fn scenario(&mut self, show: &mut dyn FnMut(&Report)) -> Result<(), Failed> {
+        std::fs::write(self.dir.path().join("dock.scxml"), PROTOCOL)?;
+        self.start("world", Role::World, "", show).await?;
+        let [(here, _), (there, _)] = HOSTS;
+        let gateway = |host: &str| format!("{host}-mts");
+        self.start(&gateway(here), Role::Gateway, here, show).await?;
+        let behind = self.tcp_address(&gateway(here)).ok_or("the gateway has no TCP address")?;
+        self.relay = Some(Relay::start(behind, self.options.link).await?);
+        self.start(&gateway(there), Role::Gateway, there, show).await?;
+        for (host, _) in HOSTS {
+            self.start(&format!("{host}-watcher"), Role::Watcher, host, show).await?;
+        }
+        if self.options.fault == Some(Fault::Rogue) {
+            self.start("rogue", Role::Rogue, here, show).await?;
+        }
+        for (host, agents) in HOSTS {
+            for (name, role) in agents {
+                self.spawn(name, *role, host)?;
+            }
+        }
+        let until = Instant::now() + RUN;
+        let mut fault = self.options.fault;
+        // The fault may last beyond the end of the work.
+        while !self.all.iter().any(|report| matches!(report.claim, Claim::Finished { .. })) {
+            let report = self.next(until, show).await?;
+            if let Some(cause) = fault
+                && self.is_time(cause, &report)
+            {
+                fault = None;
+                self.cause(cause, show).await?;
+            }
+        }
+        self.spawn("checker", Role::Checker, here)?;
+        while !matches!(self.next(until, show).await?.claim, Claim::Checked { .. }) {}
+        Ok(())
+    }
+
+    /// Whether the fault is to be caused after this report.
+    fn is_time(&self, fault: Fault, report: &Report) -> bool {
+        match (fault, &report.claim) {
+            (Fault::LinkCut, Claim::Step { .. }) => true,
+            (Fault::MasterStopped, Claim::Aligned { .. }) => true,
+            // The second docking: the item is in the gripper.
+            (Fault::ItemKilled, Claim::Step { phase, .. }) => {
+                let is_second = self.all.iter().any(|it| matches!(it.claim, Claim::Docked { .. }));
+                is_second && phase == "align"
+            }
+            _ => false,
+        }
+    }
+
+    async fn cause(&mut self, fault: Fault, show: &mut dyn FnMut(&Report)) -> Result<(), Failed> {
+        let until = |pause: Duration| Instant::now() + pause;
+        match fault {
+            Fault::ItemKilled => {
+                let Some(item) = self.held_item() else {
+                    return Err("no item is held".into());
+                };
+                if let Some(process) = self.processes.get_mut(&item) {
+                    process.child.start_kill()?;
+                }
+                self.report(&format!("{item} is killed"), show)?;
+            }
+            Fault::LinkCut => {
+                self.pass(false);
+                self.report("the link passes nothing", show)?;
+                self.until(until(CUT), show).await?;
+                self.pass(true);
+                self.report("the link passes again", show)?;
+            }
+            Fault::MasterStopped => {
+                self.signal("sherpa", Signal::STOP)?;
+                self.report("sherpa is stopped", show)?;
+                self.until(until(PAUSE), show).await?;
+                self.signal("sherpa", Signal::CONT)?;
+                self.report("sherpa goes on", show)?;
+                self.go_on("sherpa").await?;
+            }
+            Fault::Rogue | Fault::Cancel => {}
+        }
+        Ok(())
+    }
+
+    /// Returns the item in the gripper.
+    fn held_item(&self) -> Option<String> {
+        self.all.iter().find_map(|report| match &report.claim {
+            Claim::Fetched { item, held: true } => Some(item.clone()),
+            _ => None,
+        })
+    }
+
+    fn pass(&self, passes: bool) {
+        if let Some(relay) = &self.relay {
+            relay.pass(passes);
+        }
+    }
+
+    fn signal(&self, name: &str, signal: Signal) -> Result<(), Failed> {
+        let process = self.processes.get(name).and_then(|it| it.child.id());
+        let pid = process.and_then(|it| Pid::from_raw(i32::try_from(it).ok()?));
+        Ok(kill_process(pid.ok_or("the process has ended")?, signal)?)
+    }
+
+    async fn go_on(&mut self, name: &str) -> Result<(), Failed> {
+        let orders = self.processes.get_mut(name).and_then(|it| it.orders.as_mut());
+        Ok(orders.ok_or("the process has ended")?.write_all(b"go\n").await?)
+    }
+
+    /// Starts a process, and waits until it is ready.
+    async fn start(
+        &mut self,
+        name: &str,
+        role: Role,
+        host: &str,
+        show: &mut dyn FnMut(&Report),
+    ) -> Result<(), Failed> {
+        self.spawn(name, role, host)?;
+        let until = Instant::now() + STEP;
+        loop {
+            let report = self.next(until, show).await?;
+            if report.by == name && report.claim == Claim::Ready {
+                return Ok(());
+            }
+        }
+    }
+
+    fn spawn(&mut self, name: &str, role: Role, host: &str) -> Result<(), Failed> {
+        let part = Part {
+            role,
+            name: name.to_owned(),
+            set: self.settings(name, role, host),
+            world: self.path("world"),
+            recording: self.path("recording.json"),
+            seed: self.options.seed,
+            fault: self.options.fault,
+            mutant: self.options.mutant,
+        };
+        let own = self.options.item.as_ref().filter(|_| role == Role::Item);
+        let program = own.unwrap_or(&self.options.program);
+        let (program, arguments) = program.split_first().ok_or("no program")?;
+        let mut child = Command::new(program)
+            .args(arguments)
+            .arg(serde_json::to_string(&part)?)
+            .env("FIPA_RUNTIME_DIR", self.dir.path())
+            .env_remove("FIPA_CONFIG")
+            .current_dir("/")
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            // Ctrl-C is sent to the launcher only, which ends its processes in order.
+            .process_group(0)
+            .kill_on_drop(true)
+            .spawn()?;
+        let orders = child.stdin.take();
+        let output = child.stdout.take().ok_or("no standard output")?;
+        let sender = self.sender.clone();
+        tokio::spawn(async move {
+            let mut lines = BufReader::new(output).lines();
+            while let Ok(Some(line)) = lines.next_line().await {
+                if let Ok(report) = serde_json::from_str(&line)
+                    && sender.send(report).is_err()
+                {
+                    return;
+                }
+            }
+        });
+        self.processes.insert(name.to_owned(), Process { child, orders });
+        Ok(())
+    }
+
+    fn settings(&self, name: &str, role: Role, host: &str) -> Vec<String> {
+        let protocol = self.path("dock.scxml");
+        let mut set = vec![
+            format!("domain=dock-{}-{host}", std::process::id()),
+            format!("mts.name={name}"),
+            // No traffic leaves this machine, and the domains meet no others.
+            "discovery.mdns=false".to_owned(),
+            "mts.transports=shm,unix,tcp".to_owned(),
+            // Letters outlive a cut of the link.
+            "mts.deadline=20s".to_owned(),
+            format!("monitor.protocols=[{:?}]", protocol.display().to_string()),
+        ];
+        if role != Role::Rogue {
+            set.push("monitor.check=enforce".to_owned());
+        }
+        match self.relay.as_ref().filter(|_| role == Role::Gateway) {
+            // It does not listen, so that all connections between the gateways pass the relay.
+            Some(relay) => {
+                let (here, _) = HOSTS[0];
+                set.push(format!("discovery.static={{ {here}-mts = [\"tcp://{}\"] }}", relay.address));
+                set.push("transport.tcp.listen=[]".to_owned());
+            }
+            None => set.push("transport.tcp.listen=127.0.0.1:0".to_owned()),
+        }
+        set
+    }
+
+    fn path(&self, file: &str) -> PathBuf {
+        self.dir.path().join(file)
+    }
+
+    fn tcp_address(&self, gateway: &str) -> Option<std::net::SocketAddr> {
+        let locations = self.all.iter().find_map(|report| match &report.claim {
+            Claim::Listening { locations } if report.by == gateway => Some(locations),
+            _ => None,
+        })?;
+        let tcp = locations.iter().find_map(|it| it.strip_prefix("tcp://"))?;
+        tcp.split('#').next()?.parse().ok()
+    }
+
+    /// Records a claim of the launcher.
+    fn report(&mut self, what: &str, show: &mut dyn FnMut(&Report)) -> Result<(), Failed> {
+        let claim = Claim::Fault {
+            what: what.to_owned(),
+        };
+        let report = Report {
+            at: now(),
+            by: "launcher".to_owned(),
+            claim,
+        };
+        self.record(report, show)
+    }
+
+    fn record(&mut self, report: Report, show: &mut dyn FnMut(&Report)) -> Result<(), Failed> {
+        show(&report);
+        let line = serde_json::to_string(&report)?;
+        writeln!(self.recording, "{line}")?;
+        self.all.push(report);
+        Ok(())
+    }
+
+    /// Returns the next report, which is recorded.
+    async fn next(&mut self, until: Instant, show: &mut dyn FnMut(&Report)) -> Result<Report, Failed> {
+        let report = timeout_at(until, self.reports.recv()).await;
+        let report = report.map_err(|_| "the run has not ended in time")?.ok_or("no process runs")?;
+        self.record(report.clone(), show)?;
+        match &report.claim {
+            Claim::Broken { error } => Err(format!("{}: {error}", report.by).into()),
+            _ => Ok(report),
+        }
+    }
+
+    /// Records the reports up to a time.
+    async fn until(&mut self, until: Instant, show: &mut dyn FnMut(&Report)) -> Result<(), Failed> {
+        while let Ok(Some(report)) = timeout_at(until, self.reports.recv()).await {
+            self.record(report, show)?;
+        }
+        Ok(())
+    }
+
+    /// Ends all processes, the agents before their gateways and the world.
+    async fn end(&mut self, show: &mut dyn FnMut(&Report)) -> Result<(), Failed> {
+        let is_late = |name: &str| name.ends_with("-mts") || name == "world";
+        let mut stuck = Vec::new();
+        for late in [false, true] {
+            let mut ending: Vec<_> = self.processes.iter_mut().filter(|(name, _)| is_late(name) == late).collect();
+            for (_, process) in &mut ending {
+                process.orders = None;
+            }
+            let until = Instant::now() + STEP;
+            for (name, process) in ending {
+                if timeout_at(until, process.child.wait()).await.is_err() {
+                    stuck.push(name.clone());
+                    process.child.kill().await?;
+                }
+            }
+        }
+        while let Ok(report) = self.reports.try_recv() {
+            self.record(report, show)?;
+        }
+        match stuck.as_slice() {
+            [] => Ok(()),
+            names => Err(format!("these processes did not end: {}", names.join(", ")).into()),
+        }
+    }
+}
+
+/// Returns the program of a part with the name of this process, for a launcher of the same executable.
+///
+/// # Errors
+/// If the path of the executable is unknown.
+pub fn own_program(arguments: &[&str]) -> std::io::Result<Vec<OsString>> {
+    let program = std::env::current_exe()?.into_os_string();
+    Ok(std::iter::once(program).chain(arguments.iter().map(OsString::from)).collect())
+}
