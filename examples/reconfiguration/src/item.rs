@@ -62,8 +62,11 @@ pub async fn run(part: &Part) -> Result<(), Failed> {
     let images = Topic::new(IMAGES).media_type("image/x-marker").rate(RATE);
     let camera = tokio::spawn(publish(agent.publisher(images)?, camera));
     let founded = Founded::default();
-    let served = Arc::clone(&founded);
-    let _server = agent.serve("fipa-request", move |task| grow(task, Arc::clone(&served)))?;
+    let serving = (Arc::clone(&founded), reporter.clone(), part.has(Mutant::LeaderNotFenced));
+    let _server = agent.serve("fipa-request", move |task| {
+        let (founded, reporter, obeys_all) = serving.clone();
+        async move { grow(task, founded, reporter, obeys_all).await }
+    })?;
     let _member = agent.join_coalition(crate::COALITION)?;
     let pose = words::say(&hardware.encoder().await?);
     let mut service = ServiceDescription::new(&part.name, "payload");
@@ -117,13 +120,14 @@ async fn publish(images: Publisher, mut camera: Hardware) -> Result<(), Failed> 
 }
 
 /// The leader changes the members of the coalition.
-async fn grow(task: Task, founded: Founded) -> Result<Reply, DialogueError> {
+async fn grow(task: Task, founded: Founded, reporter: Reporter, obeys_all: bool) -> Result<Reply, DialogueError> {
     let founded = founded.lock().await;
     let (Some(coalition), Some(words)) = (&*founded, words::hear::<words::Members>(task.message())) else {
         return Ok(Reply::Refuse("this item has founded no coalition".into()));
     };
-    if let Err(refused) = coalition.check(task.message()) {
-        return Ok(Reply::Refuse(refused.to_string().into()));
+    let lock = format!("coalition/{}", coalition.name());
+    if !obeys_all && let Err(refused) = reporter.admission("change", &lock, coalition.check(task.message())) {
+        return Ok(Reply::Refuse(refused.into()));
     }
     Ok(match coalition.change(words.members).await {
         Ok(()) => Reply::Inform("changed".into()),

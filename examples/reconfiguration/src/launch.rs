@@ -124,6 +124,14 @@ pub async fn run(options: &Options, show: &mut dyn FnMut(&Report)) -> Result<Out
 impl Run<'_> {
     async fn scenario(&mut self, show: &mut dyn FnMut(&Report)) -> Result<(), Failed> {
         std::fs::write(self.dir.path().join("dock.scxml"), PROTOCOL)?;
+        let fault = self.options.fault.map_or("none", Fault::as_str);
+        self.claim(
+            Claim::Started {
+                fault: fault.to_owned(),
+                seed: self.options.seed,
+            },
+            show,
+        )?;
         self.start("world", Role::World, "", show).await?;
         let [(here, _), (there, _)] = HOSTS;
         let gateway = |host: &str| format!("{host}-mts");
@@ -303,7 +311,7 @@ impl Run<'_> {
             "mts.deadline=20s".to_owned(),
             format!("monitor.protocols=[{:?}]", protocol.display().to_string()),
         ];
-        if role != Role::Rogue {
+        if role != Role::Rogue && self.options.mutant != Some(Mutant::EnforcementOff) {
             set.push("monitor.check=enforce".to_owned());
         }
         match self.relay.as_ref().filter(|_| role == Role::Gateway) {
@@ -331,11 +339,14 @@ impl Run<'_> {
         tcp.split('#').next()?.parse().ok()
     }
 
-    /// Records a claim of the launcher.
+    /// Records a fault.
     fn report(&mut self, what: &str, show: &mut dyn FnMut(&Report)) -> Result<(), Failed> {
-        let claim = Claim::Fault {
-            what: what.to_owned(),
-        };
+        let what = what.to_owned();
+        self.claim(Claim::Fault { what }, show)
+    }
+
+    /// Records a claim of the launcher.
+    fn claim(&mut self, claim: Claim, show: &mut dyn FnMut(&Report)) -> Result<(), Failed> {
         let report = Report {
             at: now(),
             by: "launcher".to_owned(),

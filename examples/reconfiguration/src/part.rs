@@ -42,6 +42,8 @@ pub enum Role {
 pub enum Mutant {
     /// Items and robots do not check fences.
     FencesUnchecked,
+    /// Agents do not check letters against the protocols.
+    EnforcementOff,
     /// The master does not lock the interface of the item.
     LockSkipped,
     /// Members obey each agent that claims to lead.
@@ -72,6 +74,18 @@ pub struct Part {
     pub fault: Option<crate::Fault>,
     /// The defect of this process.
     pub mutant: Option<Mutant>,
+}
+
+impl Mutant {
+    /// All defects.
+    pub const ALL: [Self; 6] = [
+        Self::FencesUnchecked,
+        Self::EnforcementOff,
+        Self::LockSkipped,
+        Self::LeaderNotFenced,
+        Self::ReservationKept,
+        Self::ReportInvented,
+    ];
 }
 
 impl Part {

@@ -6,10 +6,12 @@ use fipa::{Agent, Domain, Message, Performative};
 
 use crate::part::{Failed, Part, Stop};
 use crate::report::{Claim, Reporter};
-use crate::words::DOCK;
+use crate::words::{self, DOCK, Members};
 
 /// The agent that it tries to mislead.
 const MASTER: &str = "sherpa";
+/// The robot that gets the stack.
+const CLIENT: &str = "crex";
 
 /// Runs the program.
 pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
@@ -23,6 +25,7 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
         agent,
         reporter,
         old: None,
+        founder: None,
     };
     let mut stop = Stop::default();
     loop {
@@ -44,6 +47,8 @@ struct Rogue {
     reporter: Reporter,
     /// An item and the fences of a docking at it, which become old.
     old: Option<(String, Vec<Fence>)>,
+    /// The first item, which founds the coalition.
+    founder: Option<String>,
 }
 
 impl Rogue {
@@ -66,7 +71,17 @@ impl Rogue {
             }
             // The docking is over: its fences are old.
             (Performative::Confirm, DOCK) if sender == MASTER => {
+                // Members that the leader does not want.
+                if let Some(founder) = &self.founder {
+                    let words = words::say(&Members {
+                        members: vec![CLIENT.to_owned(), founder.clone(), self.agent.name().to_owned()],
+                    });
+                    let change = self.agent.message(Performative::Request).receiver(founder.as_str());
+                    let change = change.protocol("fipa-request").conversation_id(self.agent.unique_id());
+                    self.report("request", founder, change.content(words)).await;
+                }
                 if let Some((item, fences)) = self.old.take() {
+                    self.founder.get_or_insert_with(|| item.clone());
                     self.send(message, Performative::Request, &item, &fences).await;
                     let content = format!(
                         r#"{{"face":"{item}/a","with":"crex/top","client":"crex","coalition":"crex_stack"}}"#
