@@ -373,7 +373,7 @@ impl Recording {
             "link-cut" => &["is unreachable"],
             "master-stopped" => &["is stale"],
             "cancel" => &["cancelled"],
-            "rogue" => &["accept-proposal from rogue", "confirm from rogue", "is stale", "carries no fence"],
+            "rogue" => &["accept-proposal from rogue", "confirm from rogue", "is stale", "has no fence of"],
             _ => &[],
         };
         match expected.iter().find(|words| !says(words)) {

@@ -32,6 +32,14 @@ impl Fault {
         Self::Cancel,
     ];
 
+    /// Returns the fault that a seed decides.
+    #[cfg(feature = "robots")]
+    #[must_use]
+    pub fn random(seed: u64) -> Self {
+        let mut rng = fastrand::Rng::with_seed(seed);
+        rng.choice(Self::ALL).unwrap_or(Self::Cancel)
+    }
+
     /// Returns the name.
     #[must_use]
     pub const fn as_str(self) -> &'static str {

@@ -5,11 +5,11 @@
 //! items on `crex`. Each agent is a process. The truth about poses is in the process of the [`world`], which the others
 //! reach as their [`hardware`]; what a robot knows of another one, it has from a letter.
 //!
-//! [`launch`] starts the processes, causes a fault, and collects the [reports](report). It decides nothing. [`check`] is
+//! [`launch`] starts the processes, causes a fault, and collects the [reports](report). It decides nothing. The checker is
 //! a program of its own, which reads the recording and the directory, and judges the end.
 
 #[cfg(feature = "robots")]
-pub mod check;
+mod check;
 #[cfg(feature = "robots")]
 mod crex;
 pub mod face;
@@ -27,6 +27,8 @@ pub mod launch;
 mod operator;
 mod owning;
 pub mod part;
+#[cfg(feature = "robots")]
+pub mod picture;
 pub mod report;
 #[cfg(feature = "robots")]
 mod relay;
@@ -34,6 +36,8 @@ mod relay;
 mod rogue;
 #[cfg(feature = "robots")]
 mod sherpa;
+#[cfg(feature = "robots")]
+pub mod telling;
 mod words;
 #[cfg(feature = "robots")]
 pub mod world;

@@ -1,10 +1,11 @@
 //! `fipa demo`: demonstrates the delivery guarantees with real processes on this machine.
 
+mod dock;
 mod process;
 mod processes;
 mod steps;
 
-use clap::Args;
+use clap::{Args, Subcommand};
 use serde_json::json;
 
 use crate::options::{self, Global};
@@ -25,11 +26,14 @@ use crate::report::Failure;
 /// The exit code is 0 only if every step passed and no file is left behind.
 #[derive(Debug, Args)]
 #[command(
+    args_conflicts_with_subcommands = true,
     after_help = "Examples:\n  fipa demo\n  fipa demo --json | jq '.steps[] | {name, ok, via}'\n\nJSON:\n  \
                   { \"steps\": [ { \"name\", \"ok\", \"error\" if it failed, details of the step } ],\n    \
                   \"measured\": the rows of the step \"measurement\" }"
 )]
 pub(crate) struct Arguments {
+    #[command(subcommand)]
+    which: Option<Which>,
     /// Print one JSON object instead of the text
     #[arg(long)]
     json: bool,
@@ -41,6 +45,11 @@ pub(crate) struct Arguments {
     name: Option<String>,
 }
 
+#[derive(Debug, Subcommand)]
+enum Which {
+    Dock(Box<dock::Arguments>),
+}
+
 #[derive(Debug, Clone, Copy, clap::ValueEnum)]
 enum Role {
     Agent,
@@ -49,6 +58,9 @@ enum Role {
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    if let Some(Which::Dock(arguments)) = arguments.which {
+        return dock::run(*arguments);
+    }
     if let (Some(role), Some(name)) = (arguments.role, arguments.name) {
         let config = global.config()?;
         let ended = options::block_on(async {

@@ -2,9 +2,11 @@
 
 use std::process::ExitCode;
 
+use fipa_acl::escape;
 use fipa_reconfiguration::launch::{self, Options};
 use fipa_reconfiguration::part::{Failed, Part};
 use fipa_reconfiguration::report::{Claim, Report, Reporter};
+use fipa_reconfiguration::telling::told;
 
 #[tokio::main]
 async fn main() -> ExitCode {
@@ -41,18 +43,16 @@ async fn run(arguments: &[&str]) -> Result<bool, Failed> {
         program: launch::own_program(&["part"])?,
         ..Options::default()
     };
+    let mut show = |report: &Report| {
+        if let Some(line) = told(report) {
+            print(&escape(&line));
+        }
+    };
     let outcome = launch::run(&options, &mut show).await?;
     for claim in &outcome.failed {
         print(&format!("failed: {claim}"));
     }
     Ok(outcome.failed.is_empty())
-}
-
-/// Prints a report, without the poses and the letters.
-fn show(report: &Report) {
-    if !matches!(report.claim, Claim::Poses { .. } | Claim::Letter { .. }) {
-        print(&serde_json::to_string(report).unwrap_or_default());
-    }
 }
 
 #[expect(clippy::print_stdout, reason = "a program prints its results")]
