@@ -349,7 +349,8 @@ impl GoalHandle<'_> {
             if was_silent && reachability.unreachable().is_empty() {
                 let again = self.robot.send(self.goal.clone()).await?.request;
                 reachability = again.reachability();
-                self.earlier.push(std::mem::replace(&mut self.request, again));
+                self.earlier
+                    .push(std::mem::replace(&mut self.request, again));
             }
         };
         match read(self.robot.language, &self.ask, &message)? {

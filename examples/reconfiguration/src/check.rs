@@ -48,7 +48,10 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
         });
         let mut checks = recording.checks();
         checks.push(("no interface is locked", free(&locks)));
-        checks.push(("the coalition is what is joined", recording.structure(listed)));
+        checks.push((
+            "the coalition is what is joined",
+            recording.structure(listed),
+        ));
         if checks.iter().all(|(_, result)| result.is_ok()) || Instant::now() >= until {
             break checks;
         }
@@ -70,10 +73,16 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
 
 /// No agent holds a resource but the leader its coalition.
 fn free(locks: &[ResourceStatus]) -> Result<(), String> {
-    let held = locks.iter().find(|lock| lock.holder.is_some() && !lock.resource.starts_with("coalition/"));
+    let held = locks
+        .iter()
+        .find(|lock| lock.holder.is_some() && !lock.resource.starts_with("coalition/"));
     match held {
         None => Ok(()),
-        Some(lock) => Err(format!("{} is held by {}", lock.resource, lock.holder.as_deref().unwrap_or("nobody"))),
+        Some(lock) => Err(format!(
+            "{} is held by {}",
+            lock.resource,
+            lock.holder.as_deref().unwrap_or("nobody")
+        )),
     }
 }
 
@@ -88,18 +97,27 @@ impl Recording {
     fn read(part: &Part) -> Result<Self, Failed> {
         let text = std::fs::read_to_string(&part.recording)?;
         // The launcher may be writing the last line.
-        let mut reports: Vec<Report> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        let mut reports: Vec<Report> = text
+            .lines()
+            .filter_map(|line| serde_json::from_str(line).ok())
+            .collect();
         reports.sort_by_key(|report| report.at);
         Ok(Self { reports })
     }
 
     fn checks(&self) -> Vec<Check> {
         vec![
-            ("each robot that fetches an item has the lowest costs", self.awards()),
+            (
+                "each robot that fetches an item has the lowest costs",
+                self.awards(),
+            ),
             ("each contact has a live fence", self.fences()),
             ("the fences of a resource rise", self.rising()),
             ("each report of a contact is true", self.contacts()),
-            ("each confirmation was sent by the one who gave it", self.letters()),
+            (
+                "each confirmation was sent by the one who gave it",
+                self.letters(),
+            ),
             ("each docking was aligned twice", self.alignments()),
             ("each docking and each lock has an end", self.ends()),
             ("no stranger is a member", self.strangers()),
@@ -110,7 +128,10 @@ impl Recording {
 
     /// Returns what a claim of this kind says, with its time and its source.
     fn all<'a, T>(&'a self, of: impl Fn(&'a Claim) -> Option<T>) -> Vec<(u64, &'a str, T)> {
-        let found = self.reports.iter().filter_map(|it| Some((it.at, it.by.as_str(), of(&it.claim)?)));
+        let found = self
+            .reports
+            .iter()
+            .filter_map(|it| Some((it.at, it.by.as_str(), of(&it.claim)?)));
         found.collect()
     }
 
@@ -124,8 +145,11 @@ impl Recording {
             _ => None,
         });
         let cost = |robot: &str, item: &str| {
-            let bid = bids.iter().find(|(_, by, (of, _))| *by == robot && *of == item);
-            bid.map(|(_, _, (_, cost))| *cost).ok_or_else(|| format!("{robot} has not bid for {item}"))
+            let bid = bids
+                .iter()
+                .find(|(_, by, (of, _))| *by == robot && *of == item);
+            bid.map(|(_, _, (_, cost))| *cost)
+                .ok_or_else(|| format!("{robot} has not bid for {item}"))
         };
         let [(_, _, (one, to_one)), (_, _, (other, to_other))] = awards.as_slice() else {
             return Err(format!("{} awards, not 2", awards.len()));
@@ -134,7 +158,9 @@ impl Recording {
         let crossed = cost(to_other, one)? + cost(to_one, other)?;
         match sum <= crossed && to_one != to_other {
             true => Ok(()),
-            false => Err(format!("{to_one} got {one} and {to_other} got {other}: {sum:.2} m, not {crossed:.2} m")),
+            false => Err(format!(
+                "{to_one} got {one} and {to_other} got {other}: {sum:.2} m, not {crossed:.2} m"
+            )),
         }
     }
 
@@ -144,14 +170,21 @@ impl Recording {
             Claim::Closed { contact } => Some(contact),
             _ => None,
         });
-        closed.into_iter().map(|(at, _, contact)| (at, contact)).collect()
+        closed
+            .into_iter()
+            .map(|(at, _, contact)| (at, contact))
+            .collect()
     }
 
     fn fences(&self) -> Result<(), String> {
         for (at, contact) in self.closed() {
             let face = contact.face.to_string();
             let admitted = self.all(|claim| match claim {
-                Claim::Admitted { action, resource, fence } if action == "latch" && *resource == face => Some(fence),
+                Claim::Admitted {
+                    action,
+                    resource,
+                    fence,
+                } if action == "latch" && *resource == face => Some(fence),
                 _ => None,
             });
             let Some((_, _, fence)) = admitted.iter().rev().find(|(then, ..)| *then <= at) else {
@@ -175,11 +208,15 @@ impl Recording {
     fn rising(&self) -> Result<(), String> {
         let mut highest: BTreeMap<&str, Fence> = BTreeMap::new();
         for (_, _, (resource, text)) in self.all(|claim| match claim {
-            Claim::Admitted { resource, fence, .. } => Some((resource, fence)),
+            Claim::Admitted {
+                resource, fence, ..
+            } => Some((resource, fence)),
             _ => None,
         }) {
             let fence: Fence = text.parse().map_err(|_| format!("{text} is no fence"))?;
-            let lower = highest.get(resource.as_str()).is_some_and(|known| fence.position() < known.position());
+            let lower = highest
+                .get(resource.as_str())
+                .is_some_and(|known| fence.position() < known.position());
             if lower {
                 return Err(format!("{resource} admitted {text} after a higher one"));
             }
@@ -191,11 +228,19 @@ impl Recording {
     fn contacts(&self) -> Result<(), String> {
         let closed = self.closed();
         for (at, by, contact) in self.all(|claim| match claim {
-            Claim::Latched { contact } | Claim::Confirmed { contact } | Claim::Docked { contact, .. } => Some(contact),
+            Claim::Latched { contact }
+            | Claim::Confirmed { contact }
+            | Claim::Docked { contact, .. } => Some(contact),
             _ => None,
         }) {
-            if !closed.iter().any(|(then, it)| *it == contact && *then <= at) {
-                return Err(format!("{by} reports that {} holds {}, which is not so", contact.face, contact.other));
+            if !closed
+                .iter()
+                .any(|(then, it)| *it == contact && *then <= at)
+            {
+                return Err(format!(
+                    "{by} reports that {} holds {}, which is not so",
+                    contact.face, contact.other
+                ));
             }
         }
         Ok(())
@@ -204,9 +249,13 @@ impl Recording {
     /// Returns the senders of the letters of the docking protocol with this act.
     fn docking_letters(&self, act: &str) -> Vec<(&str, &str)> {
         let letters = self.all(|claim| match claim {
-            Claim::Letter { sender, receiver, performative, protocol, .. }
-                if protocol == "dock" && performative == act =>
-            {
+            Claim::Letter {
+                sender,
+                receiver,
+                performative,
+                protocol,
+                ..
+            } if protocol == "dock" && performative == act => {
                 Some((sender.as_str(), receiver.as_str()))
             }
             _ => None,
@@ -217,7 +266,10 @@ impl Recording {
     fn letters(&self) -> Result<(), String> {
         let confirms = self.docking_letters("confirm");
         let count = |from: &str, to: &dyn Fn(&str) -> bool| {
-            confirms.iter().filter(|(sender, receiver)| *sender == from && to(receiver)).count()
+            confirms
+                .iter()
+                .filter(|(sender, receiver)| *sender == from && to(receiver))
+                .count()
         };
         let claimed = |by: &str| {
             self.all(|claim| match claim {
@@ -244,12 +296,18 @@ impl Recording {
             _ => None,
         }) {
             let steps = self.all(|claim| match claim {
-                Claim::Step { conversation: it, error_mm, .. } if it == conversation => Some(*error_mm),
+                Claim::Step {
+                    conversation: it,
+                    error_mm,
+                    ..
+                } if it == conversation => Some(*error_mm),
                 _ => None,
             });
             let last = steps.iter().rev().take(2);
             if steps.len() < 2 || last.clone().any(|(_, _, error)| *error >= ALIGNED) {
-                return Err(format!("the last errors of {conversation} are not below {ALIGNED} mm"));
+                return Err(format!(
+                    "the last errors of {conversation} are not below {ALIGNED} mm"
+                ));
             }
         }
         Ok(())
@@ -258,7 +316,9 @@ impl Recording {
     fn ends(&self) -> Result<(), String> {
         let ended: BTreeSet<&String> = self
             .all(|claim| match claim {
-                Claim::Docked { conversation, .. } | Claim::NotDocked { conversation, .. } => Some(conversation),
+                Claim::Docked { conversation, .. } | Claim::NotDocked { conversation, .. } => {
+                    Some(conversation)
+                }
                 _ => None,
             })
             .into_iter()
@@ -268,14 +328,23 @@ impl Recording {
             Claim::Step { conversation, .. } => Some(conversation),
             _ => None,
         });
-        if let Some((_, _, open)) = begun.iter().find(|(_, _, conversation)| !ended.contains(conversation)) {
+        if let Some((_, _, open)) = begun
+            .iter()
+            .find(|(_, _, conversation)| !ended.contains(conversation))
+        {
             return Err(format!("the docking {open} has no end"));
         }
-        let locked = self.all(|claim| matches!(claim, Claim::Locked { .. }).then_some(())).len();
-        let released = self.all(|claim| matches!(claim, Claim::Released { .. }).then_some(())).len();
+        let locked = self
+            .all(|claim| matches!(claim, Claim::Locked { .. }).then_some(()))
+            .len();
+        let released = self
+            .all(|claim| matches!(claim, Claim::Released { .. }).then_some(()))
+            .len();
         match locked == released {
             true => Ok(()),
-            false => Err(format!("{MASTER} has locked {locked} times and released {released} times")),
+            false => Err(format!(
+                "{MASTER} has locked {locked} times and released {released} times"
+            )),
         }
     }
 
@@ -284,7 +353,9 @@ impl Recording {
             Claim::Coalition { members, .. } => Some(members),
             _ => None,
         }) {
-            let stranger = members.iter().find(|it| *it != CLIENT && !it.starts_with("payload_"));
+            let stranger = members
+                .iter()
+                .find(|it| *it != CLIENT && !it.starts_with("payload_"));
             if let Some(stranger) = stranger {
                 return Err(format!("{stranger} was listed as a member"));
             }
@@ -320,11 +391,15 @@ impl Recording {
         let joined = self.joined();
         match listed {
             None if joined.len() == 1 => Ok(()),
-            None => Err(format!("{joined:?} are joined, and {COALITION} is not listed")),
-            Some((members, leader)) if members == joined && leader.as_deref() == Some(CLIENT) => Ok(()),
-            Some((members, leader)) => {
-                Err(format!("{members:?} are listed with the leader {leader:?}, and {joined:?} are joined"))
+            None => Err(format!(
+                "{joined:?} are joined, and {COALITION} is not listed"
+            )),
+            Some((members, leader)) if members == joined && leader.as_deref() == Some(CLIENT) => {
+                Ok(())
             }
+            Some((members, leader)) => Err(format!(
+                "{members:?} are listed with the leader {leader:?}, and {joined:?} are joined"
+            )),
         }
     }
 
@@ -339,14 +414,19 @@ impl Recording {
         let joined = self.joined();
         let reported: BTreeSet<String> = stack.iter().cloned().chain([CLIENT.to_owned()]).collect();
         if joined != reported {
-            return Err(format!("{reported:?} are reported, and {joined:?} are joined"));
+            return Err(format!(
+                "{reported:?} are reported, and {joined:?} are joined"
+            ));
         }
         let fault = self.fault();
         let may_miss = ["item-killed", "cancel"].contains(&fault.as_str());
         match (stack.len(), reason) {
             (2, None) => Ok(()),
             (_, Some(_)) if may_miss => Ok(()),
-            (number, reason) => Err(format!("{number} items are docked: {}", reason.as_deref().unwrap_or("no reason"))),
+            (number, reason) => Err(format!(
+                "{number} items are docked: {}",
+                reason.as_deref().unwrap_or("no reason")
+            )),
         }
     }
 
@@ -355,7 +435,10 @@ impl Recording {
             Claim::Started { fault, .. } => Some(fault),
             _ => None,
         });
-        started.first().map(|(_, _, fault)| (*fault).clone()).unwrap_or_default()
+        started
+            .first()
+            .map(|(_, _, fault)| (*fault).clone())
+            .unwrap_or_default()
     }
 
     /// Somebody who can see it reports the fault.
@@ -373,7 +456,12 @@ impl Recording {
             "link-cut" => &["is unreachable"],
             "master-stopped" => &["is stale"],
             "cancel" => &["cancelled"],
-            "rogue" => &["accept-proposal from rogue", "confirm from rogue", "is stale", "has no fence of"],
+            "rogue" => &[
+                "accept-proposal from rogue",
+                "confirm from rogue",
+                "is stale",
+                "has no fence of",
+            ],
             _ => &[],
         };
         match expected.iter().find(|words| !says(words)) {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa::coalitions::Membership;
+use fipa::coalitions::{CoalitionState, Membership};
 use fipa::locks::Owned;
 use fipa::protocol::{PartnerEvent, PartnerWatch, Reply, Task};
 use fipa::topics::{Publisher, Topic};
@@ -40,6 +40,8 @@ struct Crex<'a> {
     drive: Arc<Owned>,
     partners: PartnerWatch,
     membership: Membership,
+    /// The members as they were reported last.
+    members: Option<fipa::Members>,
     stack: Stack,
     docking: Option<Client>,
 }
@@ -67,7 +69,11 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
     let looking = (agent.clone(), Arc::clone(&stack), reporter.clone());
     let _server = agent.serve("fipa-request", move |task| {
         let (agent, stack, reporter) = looking.clone();
-        async move { look(task, agent, stack, reporter).await.map_err(|error| error.to_string()) }
+        async move {
+            look(task, agent, stack, reporter)
+                .await
+                .map_err(|error| error.to_string())
+        }
     })?;
     reporter.claim(Claim::Ready);
 
@@ -79,6 +85,7 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
         hardware: Hardware::connect(&part.world, &part.name).await?,
         drive,
         membership,
+        members: None,
         stack,
         docking: None,
     };
@@ -94,7 +101,7 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
                 }
             }
             event = crex.partners.next() => crex.partner(event).await?,
-            state = crex.membership.changed() => crex.reporter.coalition(COALITION, &state?),
+            state = crex.membership.changed() => crex.changed(&state?),
             () = stop.requested() => break,
         }
     }
@@ -145,15 +152,21 @@ async fn look(task: Task, agent: Agent, stack: Stack, reporter: Reporter) -> Res
 impl Crex<'_> {
     async fn handle(&mut self, message: &Message) -> Result<(), Failed> {
         let conversation = message.conversation_id().unwrap_or_default();
-        let open = self.docking.as_ref().filter(|it| it.conversation == conversation);
+        let open = self
+            .docking
+            .as_ref()
+            .filter(|it| it.conversation == conversation);
         match (message.performative(), open.is_some()) {
             (Performative::Request, false) => self.begin(message).await,
             (Performative::Request, true) => self.drive(message).await?,
             (Performative::Inform, true) => self.feel().await?,
-            (Performative::Failure, true) => self.tell(Performative::Failure, &message.text()).await,
+            (Performative::Failure, true) => {
+                self.tell(Performative::Failure, &message.text()).await
+            }
             (Performative::Cancel, _) => {
                 self.end("cancelled").await?;
-                self.answer(message, Performative::Inform, "stopped".into()).await;
+                self.answer(message, Performative::Inform, "stopped".into())
+                    .await;
             }
             _ => {}
         }
@@ -163,12 +176,17 @@ impl Crex<'_> {
     /// Agrees to be guided by the holder of its motors' lock.
     async fn begin(&mut self, message: &Message) {
         let Some(words) = words::hear::<Docking>(message) else {
-            return self.answer(message, Performative::Refuse, "expected a docking".into()).await;
+            return self
+                .answer(message, Performative::Refuse, "expected a docking".into())
+                .await;
         };
         if let Err(reason) = self.admit(message, "dock") {
             return self.answer(message, Performative::Refuse, reason).await;
         }
-        let master = message.sender().map(|id| id.name().to_owned()).unwrap_or_default();
+        let master = message
+            .sender()
+            .map(|id| id.name().to_owned())
+            .unwrap_or_default();
         for agent in [&master, &words.face.body] {
             self.partners.add(agent);
         }
@@ -177,13 +195,15 @@ impl Crex<'_> {
             master,
             words,
         });
-        self.answer(message, Performative::Agree, String::new()).await;
+        self.answer(message, Performative::Agree, String::new())
+            .await;
     }
 
     /// Moves its free interface at the velocity that the master wants.
     async fn drive(&mut self, message: &Message) -> Result<(), Failed> {
         let Some(Drive { twist }) = words::hear(message) else {
-            self.answer(message, Performative::Refuse, "expected a velocity".into()).await;
+            self.answer(message, Performative::Refuse, "expected a velocity".into())
+                .await;
             return Ok(());
         };
         if let Err(reason) = self.admit(message, "drive") {
@@ -193,7 +213,8 @@ impl Crex<'_> {
         let front = front(&*self.stack.lock().await);
         self.hardware.drive(twist.of_body(front)).await?;
         let pose = self.hardware.encoder().await?.then(front);
-        self.answer(message, Performative::Inform, words::say(&pose)).await;
+        self.answer(message, Performative::Inform, words::say(&pose))
+            .await;
         Ok(())
     }
 
@@ -210,7 +231,8 @@ impl Crex<'_> {
         };
         self.hardware.stop().await?;
         if !felt {
-            self.tell(Performative::Disconfirm, "the interface feels nothing").await;
+            self.tell(Performative::Disconfirm, "the interface feels nothing")
+                .await;
             return Ok(());
         }
         let contact = Contact { face, other: with };
@@ -238,11 +260,22 @@ impl Crex<'_> {
         let asked = async {
             // It leads as soon as the first item has founded the coalition.
             tokio::time::timeout(TIMEOUT, self.membership.leads()).await??;
-            let request = self.agent.request(self.membership.guard(ask)?, TIMEOUT).await?;
+            let request = self
+                .agent
+                .request(self.membership.guard(ask)?, TIMEOUT)
+                .await?;
             Ok::<_, Failed>(request.result().await?)
         };
         if let Err(error) = asked.await {
             self.reporter.noticed(error);
+        }
+    }
+
+    /// The coalition may have other members, or another leader.
+    fn changed(&mut self, state: &CoalitionState) {
+        if self.members != state.members {
+            self.members.clone_from(&state.members);
+            self.reporter.coalition(COALITION, state);
         }
     }
 
@@ -253,7 +286,8 @@ impl Crex<'_> {
             for agent in [&docking.master, &docking.words.face.body] {
                 self.partners.remove(agent);
             }
-            self.reporter.noticed(format!("the docking has ended: {why}"));
+            self.reporter
+                .noticed(format!("the docking has ended: {why}"));
         }
         Ok(())
     }
@@ -261,7 +295,9 @@ impl Crex<'_> {
     async fn partner(&mut self, event: PartnerEvent) -> Result<(), Failed> {
         match event {
             PartnerEvent::Gone { agent } => self.end(&format!("{agent} is gone")).await?,
-            PartnerEvent::Unreachable { agent, .. } => self.reporter.noticed(format!("{agent} is unreachable")),
+            PartnerEvent::Unreachable { agent, .. } => {
+                self.reporter.noticed(format!("{agent} is unreachable"))
+            }
             _ => {}
         }
         Ok(())
@@ -272,7 +308,8 @@ impl Crex<'_> {
             return Ok(());
         }
         let resource = self.drive.resource();
-        self.reporter.admission(action, resource, self.drive.check(message))
+        self.reporter
+            .admission(action, resource, self.drive.check(message))
     }
 
     /// Tells the master of the docking.
@@ -282,7 +319,9 @@ impl Crex<'_> {
         };
         let tell = self.agent.message(act).receiver(docking.master.as_str());
         let tell = tell.protocol(DOCK).conversation_id(&docking.conversation);
-        self.reporter.send(&self.agent, tell.content(content.to_owned())).await;
+        self.reporter
+            .send(&self.agent, tell.content(content.to_owned()))
+            .await;
     }
 
     async fn answer(&self, message: &Message, act: Performative, content: String) {

@@ -7,7 +7,10 @@ use serde::{Deserialize, Serialize};
 /// An electro-mechanical interface of a body.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
-#[expect(clippy::exhaustive_structs, reason = "an interface has no further part")]
+#[expect(
+    clippy::exhaustive_structs,
+    reason = "an interface has no further part"
+)]
 pub struct Face {
     /// The name of the body.
     pub body: String,

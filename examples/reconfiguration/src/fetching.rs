@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use fipa::Agent;
 use fipa::platform::ServiceDescription;
 use fipa::protocol::{Reply, Server, Task};
-use fipa::Agent;
 
 use crate::geometry::Pose;
 use crate::hardware::Hardware;

@@ -5,7 +5,10 @@ use serde::{Deserialize, Serialize};
 /// A pose: the position in meters, and the angle of the x axis in radians. Also the transform from the frame of the
 /// pose into the frame in which it is given.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[expect(clippy::exhaustive_structs, reason = "a pose in the plane has no further part")]
+#[expect(
+    clippy::exhaustive_structs,
+    reason = "a pose in the plane has no further part"
+)]
 pub struct Pose {
     /// The position along the x axis, in meters.
     pub x: f64,
@@ -59,7 +62,10 @@ impl Pose {
 
 /// A velocity in the frame of the body.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[expect(clippy::exhaustive_structs, reason = "a velocity in the plane has no further part")]
+#[expect(
+    clippy::exhaustive_structs,
+    reason = "a velocity in the plane has no further part"
+)]
 pub struct Twist {
     /// The velocity along the x axis, in meters per second.
     pub x: f64,
@@ -114,7 +120,10 @@ mod tests {
 
     fn near(left: Pose, right: Pose) {
         let seen = left.sees(right);
-        assert!(seen.distance() < 1e-9 && seen.yaw.abs() < 1e-9, "{left:?} {right:?}");
+        assert!(
+            seen.distance() < 1e-9 && seen.yaw.abs() < 1e-9,
+            "{left:?} {right:?}"
+        );
     }
 
     #[test]

@@ -8,8 +8,8 @@ use thiserror::Error;
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::UnixStream;
 
-use crate::geometry::{Pose, Twist};
 use crate::face::Face;
+use crate::geometry::{Pose, Twist};
 
 /// Length of the image of a camera, in bytes.
 pub const IMAGE: usize = 1_000_000;
@@ -63,7 +63,9 @@ impl Sight {
     pub(crate) fn write(sight: Option<&Self>, image: &mut [u8]) {
         let header = sight.and_then(|sight| serde_json::to_vec(sight).ok());
         let header = header.filter(|it| it.len() <= HEADER).unwrap_or_default();
-        let len = u16::try_from(header.len()).unwrap_or_default().to_be_bytes();
+        let len = u16::try_from(header.len())
+            .unwrap_or_default()
+            .to_be_bytes();
         for (byte, value) in image.iter_mut().zip(len.into_iter().chain(header)) {
             *byte = value;
         }

@@ -7,7 +7,7 @@ use fipa::admin::watch::{Event, Passage, WatchOptions, Watcher};
 use fipa::locks::fences_of;
 
 use crate::part::{Failed, Part, Stop};
-use crate::report::{Claim, Reporter};
+use crate::report::{Claim, Reporter, micros};
 
 /// Runs the gateway of a host.
 pub(crate) async fn gateway(part: &Part) -> Result<(), Failed> {
@@ -51,12 +51,13 @@ fn report(reporter: &Reporter, passage: &Arc<Passage>) {
     };
     let text = |value: Option<&str>| value.unwrap_or_default().to_owned();
     let fences = fences_of(message).unwrap_or_default();
-    reporter.claim(Claim::Letter {
+    let letter = Claim::Letter {
         sender: text(message.sender().map(fipa::AgentId::name)),
         receiver: passage.receiver.to_string(),
         performative: message.performative().to_string(),
         protocol: text(message.protocol()),
         conversation: text(message.conversation_id()),
         fences: fences.iter().map(ToString::to_string).collect(),
-    });
+    };
+    reporter.claim_at(micros(passage.at), letter);
 }

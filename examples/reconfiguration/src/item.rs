@@ -62,7 +62,11 @@ pub async fn run(part: &Part) -> Result<(), Failed> {
     let images = Topic::new(IMAGES).media_type("image/x-marker").rate(RATE);
     let camera = tokio::spawn(publish(agent.publisher(images)?, camera));
     let founded = Founded::default();
-    let serving = (Arc::clone(&founded), reporter.clone(), part.has(Mutant::LeaderNotFenced));
+    let serving = (
+        Arc::clone(&founded),
+        reporter.clone(),
+        part.has(Mutant::LeaderNotFenced),
+    );
     let _server = agent.serve("fipa-request", move |task| {
         let (founded, reporter, obeys_all) = serving.clone();
         async move { grow(task, founded, reporter, obeys_all).await }
@@ -120,13 +124,21 @@ async fn publish(images: Publisher, mut camera: Hardware) -> Result<(), Failed> 
 }
 
 /// The leader changes the members of the coalition.
-async fn grow(task: Task, founded: Founded, reporter: Reporter, obeys_all: bool) -> Result<Reply, DialogueError> {
+async fn grow(
+    task: Task,
+    founded: Founded,
+    reporter: Reporter,
+    obeys_all: bool,
+) -> Result<Reply, DialogueError> {
     let founded = founded.lock().await;
-    let (Some(coalition), Some(words)) = (&*founded, words::hear::<words::Members>(task.message())) else {
+    let (Some(coalition), Some(words)) = (&*founded, words::hear::<words::Members>(task.message()))
+    else {
         return Ok(Reply::Refuse("this item has founded no coalition".into()));
     };
     let lock = format!("coalition/{}", coalition.name());
-    if !obeys_all && let Err(refused) = reporter.admission("change", &lock, coalition.check(task.message())) {
+    if !obeys_all
+        && let Err(refused) = reporter.admission("change", &lock, coalition.check(task.message()))
+    {
         return Ok(Reply::Refuse(refused.into()));
     }
     Ok(match coalition.change(words.members).await {
@@ -138,14 +150,18 @@ async fn grow(task: Task, founded: Founded, reporter: Reporter, obeys_all: bool)
 impl Item<'_> {
     async fn handle(&mut self, message: &Message) -> Result<(), HardwareError> {
         let conversation = message.conversation_id().unwrap_or_default();
-        let open = self.docking.as_ref().filter(|it| it.conversation == conversation);
+        let open = self
+            .docking
+            .as_ref()
+            .filter(|it| it.conversation == conversation);
         match (message.performative(), open.is_some()) {
             (Performative::Request, false) => self.begin(message).await,
             (Performative::Request, true) => self.latch(message).await?,
             (Performative::Confirm, true) => self.complete().await,
             (Performative::Cancel, _) => {
                 self.open("cancelled").await?;
-                self.answer(message, Performative::Inform, String::from("open")).await;
+                self.answer(message, Performative::Inform, String::from("open"))
+                    .await;
             }
             _ => {}
         }
@@ -155,12 +171,17 @@ impl Item<'_> {
     /// Takes part in a docking, if the interface is free and its lock is held by the master.
     async fn begin(&mut self, message: &Message) {
         let Some(words) = words::hear::<Docking>(message) else {
-            return self.answer(message, Performative::Refuse, "expected a docking".into()).await;
+            return self
+                .answer(message, Performative::Refuse, "expected a docking".into())
+                .await;
         };
         if let Err(reason) = self.admit(message, &words.face, "dock") {
             return self.answer(message, Performative::Refuse, reason).await;
         }
-        let master = message.sender().map(|id| id.name().to_owned()).unwrap_or_default();
+        let master = message
+            .sender()
+            .map(|id| id.name().to_owned())
+            .unwrap_or_default();
         for agent in [&master, &words.client] {
             self.partners.add(agent);
         }
@@ -171,7 +192,8 @@ impl Item<'_> {
             latched: false,
             is_over: false,
         });
-        self.answer(message, Performative::Agree, String::new()).await;
+        self.answer(message, Performative::Agree, String::new())
+            .await;
     }
 
     /// Latches, and tells the client.
@@ -199,7 +221,8 @@ impl Item<'_> {
         }
         let tell = self.agent.message(act).receiver(client).protocol(DOCK);
         let conversation = message.conversation_id().unwrap_or_default();
-        self.send(tell.conversation_id(conversation).content(content)).await;
+        self.send(tell.conversation_id(conversation).content(content))
+            .await;
         Ok(())
     }
 
@@ -213,7 +236,9 @@ impl Item<'_> {
         }
         if words.with.body == words.client {
             let members = [words.client.as_str(), &self.part.name];
-            let founding = self.agent.found_coalition(&words.coalition, members, coalition_options());
+            let founding =
+                self.agent
+                    .found_coalition(&words.coalition, members, coalition_options());
             match founding.await {
                 Ok(coalition) => *self.founded.lock().await = Some(coalition),
                 Err(error) => self.reporter.noticed(error),
@@ -235,14 +260,17 @@ impl Item<'_> {
             self.hardware.open(&face.side).await?;
         }
         self.reporter.claim(Claim::Unlatched { face });
-        self.reporter.noticed(format!("the docking has ended: {why}"));
+        self.reporter
+            .noticed(format!("the docking has ended: {why}"));
         Ok(())
     }
 
     async fn partner(&mut self, event: PartnerEvent) -> Result<(), HardwareError> {
         match event {
             PartnerEvent::Gone { agent } => self.open(&format!("{agent} is gone")).await?,
-            PartnerEvent::Unreachable { agent, .. } => self.reporter.noticed(format!("{agent} is unreachable")),
+            PartnerEvent::Unreachable { agent, .. } => {
+                self.reporter.noticed(format!("{agent} is unreachable"))
+            }
             _ => {}
         }
         Ok(())
@@ -271,11 +299,13 @@ impl Item<'_> {
         let Some(owned) = owned else {
             return Err(format!("this item has no interface {resource}"));
         };
-        self.reporter.admission(action, &resource, owned.check(message))
+        self.reporter
+            .admission(action, &resource, owned.check(message))
     }
 
     async fn answer(&self, message: &Message, act: Performative, content: String) {
-        self.send(self.agent.reply(message, act).content(content)).await;
+        self.send(self.agent.reply(message, act).content(content))
+            .await;
     }
 
     async fn send(&self, message: fipa::MessageBuilder) {

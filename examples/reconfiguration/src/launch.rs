@@ -32,8 +32,18 @@ const PAUSE: Duration = Duration::from_secs(6);
 
 /// The hosts, each with its agents.
 const HOSTS: [(&str, &[(&str, Role)]); 2] = [
-    ("sherpa", &[("sherpa", Role::Sherpa), ("payload_1", Role::Item), ("payload_2", Role::Item)]),
-    ("crex", &[("crex", Role::Crex), ("operator", Role::Operator)]),
+    (
+        "sherpa",
+        &[
+            ("sherpa", Role::Sherpa),
+            ("payload_1", Role::Item),
+            ("payload_2", Role::Item),
+        ],
+    ),
+    (
+        "crex",
+        &[("crex", Role::Crex), ("operator", Role::Operator)],
+    ),
 ];
 
 /// The options of a run.
@@ -90,7 +100,7 @@ struct Run<'a> {
 pub async fn run(options: &Options, show: &mut dyn FnMut(&Report)) -> Result<Outcome, Failed> {
     // Private and with a random name: another user cannot create it first.
     let dir = tempfile::Builder::new()
-        .prefix("fipa-dock-")
+        .prefix("dock-")
         .permissions(std::fs::Permissions::from_mode(0o700))
         .tempdir()?;
     let (sender, reports) = mpsc::unbounded_channel();
@@ -106,14 +116,25 @@ pub async fn run(options: &Options, show: &mut dyn FnMut(&Report)) -> Result<Out
     };
     let ran = run.scenario(show).await;
     let ended = run.end(show).await;
+    let left = run.clear();
     ran?;
     ended?;
     let mut reports = run.all;
     reports.sort_by_key(|report| report.at);
-    let (passed, failed) = reports.iter().rev().find_map(|report| match &report.claim {
-        Claim::Checked { passed, failed } => Some((passed.clone(), failed.clone())),
-        _ => None,
-    }).ok_or("the checker has not reported")?;
+    let (passed, failed) = reports
+        .iter()
+        .rev()
+        .find_map(|report| match &report.claim {
+            Claim::Checked { passed, failed } => Some((passed.clone(), failed.clone())),
+            _ => None,
+        })
+        .ok_or("the checker has not reported")?;
+    let (mut passed, mut failed) = (passed, failed);
+    let check = "no files are left behind";
+    match left.first() {
+        None => passed.push(check.to_owned()),
+        Some(first) => failed.push(format!("{check}: {} are, the first is {first}", left.len())),
+    }
     Ok(Outcome {
         reports,
         passed,
@@ -135,12 +156,17 @@ impl Run<'_> {
         self.start("world", Role::World, "", show).await?;
         let [(here, _), (there, _)] = HOSTS;
         let gateway = |host: &str| format!("{host}-mts");
-        self.start(&gateway(here), Role::Gateway, here, show).await?;
-        let behind = self.tcp_address(&gateway(here)).ok_or("the gateway has no TCP address")?;
+        self.start(&gateway(here), Role::Gateway, here, show)
+            .await?;
+        let behind = self
+            .tcp_address(&gateway(here))
+            .ok_or("the gateway has no TCP address")?;
         self.relay = Some(Relay::start(behind, self.options.link).await?);
-        self.start(&gateway(there), Role::Gateway, there, show).await?;
+        self.start(&gateway(there), Role::Gateway, there, show)
+            .await?;
         for (host, _) in HOSTS {
-            self.start(&format!("{host}-watcher"), Role::Watcher, host, show).await?;
+            self.start(&format!("{host}-watcher"), Role::Watcher, host, show)
+                .await?;
         }
         if self.options.fault == Some(Fault::Rogue) {
             self.start("rogue", Role::Rogue, here, show).await?;
@@ -153,7 +179,11 @@ impl Run<'_> {
         let until = Instant::now() + RUN;
         let mut fault = self.options.fault;
         // The fault may last beyond the end of the work.
-        while !self.all.iter().any(|report| matches!(report.claim, Claim::Finished { .. })) {
+        while !self
+            .all
+            .iter()
+            .any(|report| matches!(report.claim, Claim::Finished { .. }))
+        {
             let report = self.next(until, show).await?;
             if let Some(cause) = fault
                 && self.is_time(cause, &report)
@@ -174,7 +204,10 @@ impl Run<'_> {
             (Fault::MasterStopped, Claim::Aligned { .. }) => true,
             // The second docking: the item is in the gripper.
             (Fault::ItemKilled, Claim::Step { phase, .. }) => {
-                let is_second = self.all.iter().any(|it| matches!(it.claim, Claim::Docked { .. }));
+                let is_second = self
+                    .all
+                    .iter()
+                    .any(|it| matches!(it.claim, Claim::Docked { .. }));
                 is_second && phase == "align"
             }
             _ => false,
@@ -234,8 +267,14 @@ impl Run<'_> {
     }
 
     async fn go_on(&mut self, name: &str) -> Result<(), Failed> {
-        let orders = self.processes.get_mut(name).and_then(|it| it.orders.as_mut());
-        Ok(orders.ok_or("the process has ended")?.write_all(b"go\n").await?)
+        let orders = self
+            .processes
+            .get_mut(name)
+            .and_then(|it| it.orders.as_mut());
+        Ok(orders
+            .ok_or("the process has ended")?
+            .write_all(b"go\n")
+            .await?)
     }
 
     /// Starts a process, and waits until it is ready.
@@ -295,14 +334,15 @@ impl Run<'_> {
                 }
             }
         });
-        self.processes.insert(name.to_owned(), Process { child, orders });
+        self.processes
+            .insert(name.to_owned(), Process { child, orders });
         Ok(())
     }
 
     fn settings(&self, name: &str, role: Role, host: &str) -> Vec<String> {
         let protocol = self.path("dock.scxml");
         let mut set = vec![
-            format!("domain=dock-{}-{host}", std::process::id()),
+            format!("domain={}-{host}", self.name()),
             format!("mts.name={name}"),
             // No traffic leaves this machine, and the domains meet no others.
             "discovery.mdns=false".to_owned(),
@@ -318,12 +358,37 @@ impl Run<'_> {
             // It does not listen, so that all connections between the gateways pass the relay.
             Some(relay) => {
                 let (here, _) = HOSTS[0];
-                set.push(format!("discovery.static={{ {here}-mts = [\"tcp://{}\"] }}", relay.address));
+                set.push(format!(
+                    "discovery.static={{ {here}-mts = [\"tcp://{}\"] }}",
+                    relay.address
+                ));
                 set.push("transport.tcp.listen=[]".to_owned());
             }
             None => set.push("transport.tcp.listen=127.0.0.1:0".to_owned()),
         }
         set
+    }
+
+    /// Returns the unique name of the run, with which the names of its domains begin.
+    fn name(&self) -> String {
+        let name = self.dir.path().file_name().unwrap_or_default();
+        name.to_string_lossy().into_owned()
+    }
+
+    /// Removes the files in shared memory that processes have left. Returns their names.
+    fn clear(&self) -> Vec<String> {
+        let mark = format!("fipa_{}-", self.name());
+        let files = std::fs::read_dir("/dev/shm")
+            .into_iter()
+            .flatten()
+            .flatten();
+        let ours = files.filter(|file| file.file_name().to_string_lossy().starts_with(&mark));
+        let removed = ours.map(|file| {
+            // Another process may have removed it.
+            let _ = std::fs::remove_file(file.path());
+            file.file_name().to_string_lossy().into_owned()
+        });
+        removed.collect()
     }
 
     fn path(&self, file: &str) -> PathBuf {
@@ -364,9 +429,15 @@ impl Run<'_> {
     }
 
     /// Returns the next report, which is recorded.
-    async fn next(&mut self, until: Instant, show: &mut dyn FnMut(&Report)) -> Result<Report, Failed> {
+    async fn next(
+        &mut self,
+        until: Instant,
+        show: &mut dyn FnMut(&Report),
+    ) -> Result<Report, Failed> {
         let report = timeout_at(until, self.reports.recv()).await;
-        let report = report.map_err(|_| "the run has not ended in time")?.ok_or("no process runs")?;
+        let report = report
+            .map_err(|_| "the run has not ended in time")?
+            .ok_or("no process runs")?;
         self.record(report.clone(), show)?;
         match &report.claim {
             Claim::Broken { error } => Err(format!("{}: {error}", report.by).into()),
@@ -387,7 +458,11 @@ impl Run<'_> {
         let is_late = |name: &str| name.ends_with("-mts") || name == "world";
         let mut stuck = Vec::new();
         for late in [false, true] {
-            let mut ending: Vec<_> = self.processes.iter_mut().filter(|(name, _)| is_late(name) == late).collect();
+            let mut ending: Vec<_> = self
+                .processes
+                .iter_mut()
+                .filter(|(name, _)| is_late(name) == late)
+                .collect();
             for (_, process) in &mut ending {
                 process.orders = None;
             }
@@ -415,5 +490,7 @@ impl Run<'_> {
 /// If the path of the executable is unknown.
 pub fn own_program(arguments: &[&str]) -> std::io::Result<Vec<OsString>> {
     let program = std::env::current_exe()?.into_os_string();
-    Ok(std::iter::once(program).chain(arguments.iter().map(OsString::from)).collect())
+    Ok(std::iter::once(program)
+        .chain(arguments.iter().map(OsString::from))
+        .collect())
 }

@@ -29,9 +29,9 @@ mod owning;
 pub mod part;
 #[cfg(feature = "robots")]
 pub mod picture;
-pub mod report;
 #[cfg(feature = "robots")]
 mod relay;
+pub mod report;
 #[cfg(feature = "robots")]
 mod rogue;
 #[cfg(feature = "robots")]

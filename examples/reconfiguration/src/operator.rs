@@ -51,7 +51,10 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
 /// Returns the pose in the description of a service.
 pub(crate) fn pose(service: &ServiceDescription) -> Option<Pose> {
     let mut all = service.properties.iter();
-    let pose = all.find(|property| property.name == "pose")?.value.as_ref()?;
+    let pose = all
+        .find(|property| property.name == "pose")?
+        .value
+        .as_ref()?;
     serde_json::from_str(pose.as_str()?).ok()
 }
 
@@ -73,13 +76,19 @@ impl Operator<'_> {
         let robots = self.find(fetching::SERVICE, 2).await?;
         let items = self.find("payload", 2).await?;
         let guides = self.find(sherpa::SERVICE, 1).await?;
-        let guide = guides.first().and_then(|guide| guide.name.clone()).ok_or("no guide")?;
+        let guide = guides
+            .first()
+            .and_then(|guide| guide.name.clone())
+            .ok_or("no guide")?;
         // The robot that gets the stack docks first: the other one holds its item until it comes.
         for item in self.allocate(&robots, &items).await? {
             self.dock(&guide, &item, stack).await?;
             stack.push(item);
         }
-        let look = self.agent.message(Performative::Request).receiver(COALITION);
+        let look = self
+            .agent
+            .message(Performative::Request)
+            .receiver(COALITION);
         let request = self.agent.request(look.content("look"), TIMEOUT).await?;
         request.result().await?;
         Ok(())
@@ -115,8 +124,17 @@ impl Operator<'_> {
         let robots: Vec<AgentId> = robots.iter().filter_map(|it| it.name.clone()).collect();
         let mut nets = Vec::new();
         for item in items {
-            let name = item.name.as_ref().ok_or("an item has no name")?.name().to_owned();
-            let pose = item.services.iter().find_map(pose).ok_or("an item has no pose")?;
+            let name = item
+                .name
+                .as_ref()
+                .ok_or("an item has no name")?
+                .name()
+                .to_owned();
+            let pose = item
+                .services
+                .iter()
+                .find_map(pose)
+                .ok_or("an item has no pose")?;
             let item = name.clone();
             let call = self.agent.message(Performative::Cfp);
             let call = call.content(words::say(&Fetch { item, pose }));
@@ -127,7 +145,10 @@ impl Operator<'_> {
         let [(first, net_1, bids_1), (second, net_2, bids_2)] = nets.as_mut_slice() else {
             return Err("expected two items".into());
         };
-        let other = robots.iter().find(|it| it.name() != CLIENT).ok_or("one robot only")?;
+        let other = robots
+            .iter()
+            .find(|it| it.name() != CLIENT)
+            .ok_or("one robot only")?;
         let cost = |bids: &Bids, robot: &str| bids.get(robot).map_or(f64::INFINITY, |bid| bid.0);
         let straight = cost(bids_1, CLIENT) + cost(bids_2, other.name());
         let crossed = cost(bids_2, CLIENT) + cost(bids_1, other.name());
@@ -148,14 +169,26 @@ impl Operator<'_> {
         Ok(order)
     }
 
-    async fn award(&self, item: &str, net: &mut ContractNet, bids: &Bids, robot: &str) -> Result<(), Failed> {
+    async fn award(
+        &self,
+        item: &str,
+        net: &mut ContractNet,
+        bids: &Bids,
+        robot: &str,
+    ) -> Result<(), Failed> {
         self.reporter.claim(Claim::Award {
             item: item.to_owned(),
-            bids: bids.iter().map(|(name, bid)| (name.clone(), bid.0)).collect(),
+            bids: bids
+                .iter()
+                .map(|(name, bid)| (name.clone(), bid.0))
+                .collect(),
             robot: robot.to_owned(),
         });
         let (_, proposal) = bids.get(robot).ok_or("no bid")?;
-        for awarded in net.award(std::slice::from_ref(proposal), "", TIMEOUT).await? {
+        for awarded in net
+            .award(std::slice::from_ref(proposal), "", TIMEOUT)
+            .await?
+        {
             awarded.result?;
         }
         Ok(())
@@ -177,7 +210,9 @@ impl Operator<'_> {
             match self.attempt(guide, &goal).await {
                 Ok(_) => return Ok(()),
                 Err(error) if attempt == ATTEMPTS || self.gives_up(item) => return Err(error),
-                Err(error) => self.reporter.noticed(format!("attempt {attempt} to dock {item}: {error}")),
+                Err(error) => self
+                    .reporter
+                    .noticed(format!("attempt {attempt} to dock {item}: {error}")),
             }
             attempt += 1;
         }

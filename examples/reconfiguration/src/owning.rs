@@ -34,7 +34,10 @@ pub(crate) async fn own_all(
     reporter: &Reporter,
     ended: &Arc<Notify>,
 ) -> Result<[Arc<Owned>; 2], OwnError> {
-    let (one, other) = tokio::try_join!(agent.own(one, own_options()), agent.own(other, own_options()))?;
+    let (one, other) = tokio::try_join!(
+        agent.own(one, own_options()),
+        agent.own(other, own_options())
+    )?;
     let owned = [one, other].map(Arc::new);
     for owned in &owned {
         let (owned, reporter, ended) = (Arc::clone(owned), reporter.clone(), Arc::clone(ended));

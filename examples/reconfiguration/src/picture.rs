@@ -3,7 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use fipa_drawing::{
-    Arrow, Body, Color, Interval, Mark, Note, Page, Plane, Section, Sequence, Shape, Step, Timeline, TimelineRow,
+    Arrow, Body, Color, Interval, Mark, Note, Page, Plane, Section, Sequence, Shape, Step,
+    Timeline, TimelineRow,
 };
 
 use crate::report::{Claim, Report};
@@ -11,12 +12,19 @@ use crate::report::{Claim, Report};
 /// The bodies, in the order of their colors.
 const BODIES: [&str; 4] = ["sherpa", "crex", "payload_1", "payload_2"];
 
+/// The label of a body that belongs to no coalition.
+const ALONE: &str = "alone";
+
 /// Draws a run.
 #[must_use]
 pub fn page(reports: &[Report]) -> Page {
     let run = Run::of(reports);
     let (fault, seed) = run.started();
-    let fault = if fault == "none" { "no fault".to_owned() } else { format!("fault: {fault}") };
+    let fault = if fault == "none" {
+        "no fault".to_owned()
+    } else {
+        format!("fault: {fault}")
+    };
     Page {
         title: "A stack of two items on crex".to_owned(),
         text: format!("Two robots fetch, reserve and dock two payload items, and become one; {fault}, seed {seed}"),
@@ -26,8 +34,8 @@ pub fn page(reports: &[Report]) -> Page {
                 ..Section::new("The plane", run.plane())
             },
             Section {
-                text: "Seconds since the start. A bar is the time as a member of the merged robot.".to_owned(),
-                ..Section::new("Members of crex_stack", run.members())
+                text: "Seconds since the operator searched. A bar is the robot that a body belongs to.".to_owned(),
+                ..Section::new("Who belongs to what", run.members())
             },
             Section {
                 text: "A bar is a grant: its holder, and the number of its fence.".to_owned(),
@@ -50,9 +58,14 @@ struct Run<'a> {
 impl<'a> Run<'a> {
     fn of(reports: &'a [Report]) -> Self {
         // The waits for the processes are not drawn.
-        let begins = reports.iter().find(|it| matches!(it.claim, Claim::Found { .. }));
+        let begins = reports
+            .iter()
+            .find(|it| matches!(it.claim, Claim::Found { .. }));
         let start = begins.or(reports.first()).map_or(0, |report| report.at);
-        let ends = reports.iter().rev().find(|it| matches!(it.claim, Claim::Finished { .. }));
+        let ends = reports
+            .iter()
+            .rev()
+            .find(|it| matches!(it.claim, Claim::Finished { .. }));
         let end = ends.or(reports.last()).map_or(start, |report| report.at);
         let mut run = Self {
             reports,
@@ -104,9 +117,23 @@ impl<'a> Run<'a> {
     }
 
     fn members(&self) -> Timeline {
-        let mut rows: BTreeMap<&str, Vec<Interval>> = BODIES.iter().map(|name| (*name, Vec::new())).collect();
+        let interval = |index: usize, label: &str, from: f64| Interval {
+            label: label.to_owned(),
+            from,
+            until: None,
+            color: Color::nth(index),
+        };
+        let alone =
+            |(index, name): (usize, &&'static str)| (*name, vec![interval(index, ALONE, 0.0)]);
+        let mut rows: BTreeMap<&str, Vec<Interval>> =
+            BODIES.iter().enumerate().map(alone).collect();
         for report in self.reports {
-            let Claim::Coalition { name, members, leader } = &report.claim else {
+            let Claim::Coalition {
+                name,
+                members,
+                leader,
+            } = &report.claim
+            else {
                 continue;
             };
             let at = self.seconds(report.at);
@@ -114,22 +141,17 @@ impl<'a> Run<'a> {
                 let Some(row) = rows.get_mut(body) else {
                     continue;
                 };
-                let leads = leader.as_deref() == Some(body);
-                let label = if leads { format!("{name}, leader") } else { name.clone() };
-                let is_member = members.iter().any(|member| member == body);
-                let open = row.last_mut().filter(|interval| interval.until.is_none());
-                match open {
-                    Some(open) if is_member && (open.label == label || leader.is_none()) => continue,
-                    Some(open) => open.until = Some(at),
-                    None => {}
-                }
-                if is_member {
-                    row.push(Interval {
-                        label,
-                        from: at,
-                        until: None,
-                        color: Color::nth(index),
-                    });
+                let label = match (
+                    members.iter().any(|member| member == body),
+                    leader.as_deref() == Some(body),
+                ) {
+                    (false, _) => ALONE.to_owned(),
+                    (true, false) => name.clone(),
+                    (true, true) => format!("{name}, leader"),
+                };
+                if let Some(open) = row.last_mut().filter(|open| open.label != label) {
+                    open.until = Some(at);
+                    row.push(interval(index, &label, at));
                 }
             }
         }
@@ -149,9 +171,16 @@ impl<'a> Run<'a> {
         for report in self.reports {
             let at = self.seconds(report.at);
             match &report.claim {
-                Claim::Granted { resource, holder, fence } => {
+                Claim::Granted {
+                    resource,
+                    holder,
+                    fence,
+                } => {
                     let number = fence.split('.').nth(1).unwrap_or_default();
-                    let color = BODIES.iter().position(|body| body == holder).unwrap_or(BODIES.len());
+                    let color = BODIES
+                        .iter()
+                        .position(|body| body == holder)
+                        .unwrap_or(BODIES.len());
                     let interval = Interval {
                         label: format!("{holder} #{number}"),
                         from: at,
@@ -160,7 +189,9 @@ impl<'a> Run<'a> {
                     };
                     rows.entry(resource).or_default().push((fence, interval));
                 }
-                Claim::Ended { resource, fence, .. } => {
+                Claim::Ended {
+                    resource, fence, ..
+                } => {
                     let row = rows.entry(resource).or_default();
                     if let Some((_, interval)) = row.iter_mut().find(|(it, _)| it == fence) {
                         interval.until = Some(at);
@@ -171,7 +202,10 @@ impl<'a> Run<'a> {
         }
         let rows = rows.into_iter().map(|(name, intervals)| TimelineRow {
             name: name.to_owned(),
-            intervals: intervals.into_iter().map(|(_, interval)| interval).collect(),
+            intervals: intervals
+                .into_iter()
+                .map(|(_, interval)| interval)
+                .collect(),
         });
         Timeline {
             rows: rows.collect(),
@@ -181,13 +215,17 @@ impl<'a> Run<'a> {
     }
 
     fn marks(&self) -> Vec<Mark> {
-        let faults = self.reports.iter().filter(|it| it.by == "launcher").filter_map(|it| match &it.claim {
-            Claim::Fault { what } => Some(Mark {
-                at: self.seconds(it.at),
-                label: what.clone(),
-            }),
-            _ => None,
-        });
+        let faults = self
+            .reports
+            .iter()
+            .filter(|it| it.by == "launcher")
+            .filter_map(|it| match &it.claim {
+                Claim::Fault { what } => Some(Mark {
+                    at: self.seconds(it.at),
+                    label: what.clone(),
+                }),
+                _ => None,
+            });
         faults.collect()
     }
 
@@ -213,33 +251,50 @@ impl<'a> Run<'a> {
             matches!(&report.claim, Claim::Letter { conversation, protocol, .. }
                 if conversation == drawn && protocol == "dock")
         };
-        let mut times = self.reports.iter().filter(|it| is_drawn(it)).map(|it| it.at);
-        let (from, to) = (times.next().unwrap_or_default(), times.last().unwrap_or_default());
+        let mut times = self
+            .reports
+            .iter()
+            .filter(|it| is_drawn(it))
+            .map(|it| it.at);
+        let (from, to) = (
+            times.next().unwrap_or_default(),
+            times.last().unwrap_or_default(),
+        );
         let agents: BTreeSet<&str> = BODIES.into_iter().collect();
-        let steps = self.reports.iter().filter(|it| (from..=to).contains(&it.at)).filter_map(|it| match &it.claim {
-            Claim::Letter { sender, receiver, performative, .. } if is_drawn(it) => Some(Step::Arrow(Arrow {
-                from: sender.clone(),
-                to: receiver.clone(),
-                label: performative.clone(),
-                time: time(it.at),
-                violation: (!agents.contains(sender.as_str())).then(|| "takes no part".to_owned()),
-                ..Arrow::default()
-            })),
-            Claim::Fault { what } if it.by == "launcher" => {
-                let lane = what.split(' ').next().filter(|word| agents.contains(word));
-                Some(Step::Note(Note {
-                    lane: lane.unwrap_or("sherpa").to_owned(),
-                    text: what.clone(),
+        let steps = self
+            .reports
+            .iter()
+            .filter(|it| (from..=to).contains(&it.at))
+            .filter_map(|it| match &it.claim {
+                Claim::Letter {
+                    sender,
+                    receiver,
+                    performative,
+                    ..
+                } if is_drawn(it) => Some(Step::Arrow(Arrow {
+                    from: sender.clone(),
+                    to: receiver.clone(),
+                    label: performative.clone(),
                     time: time(it.at),
-                }))
-            }
-            Claim::Refused { action, .. } => Some(Step::Note(Note {
-                lane: it.by.clone(),
-                text: format!("refuses to {action}: its fence is stale"),
-                time: time(it.at),
-            })),
-            _ => None,
-        });
+                    violation: (!agents.contains(sender.as_str()))
+                        .then(|| "takes no part".to_owned()),
+                    ..Arrow::default()
+                })),
+                Claim::Fault { what } if it.by == "launcher" => {
+                    let lane = what.split(' ').next().filter(|word| agents.contains(word));
+                    Some(Step::Note(Note {
+                        lane: lane.unwrap_or("sherpa").to_owned(),
+                        text: what.clone(),
+                        time: time(it.at),
+                    }))
+                }
+                Claim::Refused { action, .. } => Some(Step::Note(Note {
+                    lane: it.by.clone(),
+                    text: format!("refuses to {action}: its fence is stale"),
+                    time: time(it.at),
+                })),
+                _ => None,
+            });
         Sequence {
             lanes: vec!["sherpa".to_owned(), "crex".to_owned()],
             steps: steps.collect(),

@@ -47,7 +47,8 @@ impl Relay {
                     let Ok(to) = TcpStream::connect(to).await else {
                         return;
                     };
-                    let ((from_in, from_out), (to_in, to_out)) = (from.into_split(), to.into_split());
+                    let ((from_in, from_out), (to_in, to_out)) =
+                        (from.into_split(), to.into_split());
                     tokio::join!(
                         forward(from_in, to_out, link, seen.clone()),
                         forward(to_in, from_out, link, seen)
@@ -65,13 +66,22 @@ impl Relay {
 }
 
 /// Forwards one direction of a connection.
-async fn forward(mut from: OwnedReadHalf, to: OwnedWriteHalf, link: Link, passes: watch::Receiver<bool>) {
+async fn forward(
+    mut from: OwnedReadHalf,
+    to: OwnedWriteHalf,
+    link: Link,
+    passes: watch::Receiver<bool>,
+) {
     let (chunks, received) = mpsc::channel(UNDER_WAY);
     let writing = tokio::spawn(write(to, link, received, passes));
     let mut chunk = vec![0; CHUNK];
     while let Ok(len @ 1..) = from.read(&mut chunk).await {
         let arrived = chunk.get(..len).unwrap_or_default().to_vec();
-        if chunks.send((Instant::now() + link.delay, arrived)).await.is_err() {
+        if chunks
+            .send((Instant::now() + link.delay, arrived))
+            .await
+            .is_err()
+        {
             break;
         }
     }

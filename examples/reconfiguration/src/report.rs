@@ -10,8 +10,8 @@ use fipa::locks::{AdmitError, Fence, OwnerEvent};
 use fipa::{Agent, MessageBuilder};
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::Pose;
 use crate::face::{Contact, Face};
+use crate::geometry::Pose;
 
 /// A claim of one process, one JSON document in a line.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -56,7 +56,10 @@ pub enum Claim {
         fences: Vec<String>,
     },
     /// The operator: the agents with a service.
-    Found { service: String, agents: Vec<String> },
+    Found {
+        service: String,
+        agents: Vec<String>,
+    },
     /// A robot: its announced cost.
     Bid { item: String, cost: f64 },
     /// The operator: the bids for an item, and the robot that is to fetch it.
@@ -72,7 +75,11 @@ pub enum Claim {
     /// The master: it has released its locks.
     Released { fences: BTreeMap<String, String> },
     /// An owner: a grant.
-    Granted { resource: String, holder: String, fence: String },
+    Granted {
+        resource: String,
+        holder: String,
+        fence: String,
+    },
     /// An owner: the end of a grant.
     Ended {
         resource: String,
@@ -81,11 +88,19 @@ pub enum Claim {
         how: String,
     },
     /// The master: a step of the guidance, and the error that the camera shows, in millimeters.
-    Step { conversation: String, error_mm: f64, phase: String },
+    Step {
+        conversation: String,
+        error_mm: f64,
+        phase: String,
+    },
     /// The master: the client is in place, and the latch comes next.
     Aligned { conversation: String },
     /// An item or a client: it obeys a command.
-    Admitted { action: String, resource: String, fence: String },
+    Admitted {
+        action: String,
+        resource: String,
+        fence: String,
+    },
     /// An item or a client: it does not obey.
     Refused { action: String, reason: String },
     /// An item: its interface holds another one.
@@ -102,7 +117,10 @@ pub enum Claim {
         seconds: f64,
     },
     /// The master: the docking has ended without a contact.
-    NotDocked { conversation: String, reason: String },
+    NotDocked {
+        conversation: String,
+        reason: String,
+    },
     /// A member: the coalition as it sees it.
     Coalition {
         name: String,
@@ -112,11 +130,21 @@ pub enum Claim {
     /// Somebody notices a fault.
     Noticed { what: String },
     /// An image of a camera, which the leader was asked for.
-    Image { of: String, bytes: usize, marker: Option<String> },
+    Image {
+        of: String,
+        bytes: usize,
+        marker: Option<String>,
+    },
     /// The operator: the end of the scenario.
-    Finished { stack: Vec<String>, reason: Option<String> },
+    Finished {
+        stack: Vec<String>,
+        reason: Option<String>,
+    },
     /// The checker: what it has found.
-    Checked { passed: Vec<String>, failed: Vec<String> },
+    Checked {
+        passed: Vec<String>,
+        failed: Vec<String>,
+    },
     /// The process has ended with an error.
     Broken { error: String },
 }
@@ -134,8 +162,13 @@ impl Reporter {
 
     /// Writes a claim.
     pub fn claim(&self, claim: Claim) {
+        self.claim_at(now(), claim);
+    }
+
+    /// Writes a claim about this time, in microseconds since 1970.
+    pub(crate) fn claim_at(&self, at: u64, claim: Claim) {
         let report = Report {
-            at: now(),
+            at,
             by: self.0.clone(),
             claim,
         };
@@ -156,8 +189,15 @@ impl Reporter {
 
 /// Returns the present time, in microseconds since 1970.
 pub(crate) fn now() -> u64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH);
-    since.map_or(0, |since| u64::try_from(since.as_micros()).unwrap_or(u64::MAX))
+    micros(SystemTime::now())
+}
+
+/// Returns a time in microseconds since 1970.
+pub(crate) fn micros(time: SystemTime) -> u64 {
+    let since = time.duration_since(UNIX_EPOCH);
+    since.map_or(0, |since| {
+        u64::try_from(since.as_micros()).unwrap_or(u64::MAX)
+    })
 }
 
 impl Reporter {

@@ -53,7 +53,10 @@ struct Rogue {
 
 impl Rogue {
     async fn disturb(&mut self, message: &Message, receiver: &str) {
-        let sender = message.sender().map(fipa::AgentId::name).unwrap_or_default();
+        let sender = message
+            .sender()
+            .map(fipa::AgentId::name)
+            .unwrap_or_default();
         if sender == self.agent.name() {
             return;
         }
@@ -61,12 +64,16 @@ impl Rogue {
         match (message.performative(), protocol) {
             // An award that the operator has not given.
             (Performative::Cfp, _) if receiver == MASTER => {
-                self.send(message, Performative::AcceptProposal, MASTER, &[]).await;
+                self.send(message, Performative::AcceptProposal, MASTER, &[])
+                    .await;
             }
             // A contact that the client has not felt.
-            (Performative::Request, DOCK) if sender == MASTER && receiver.starts_with("payload") => {
+            (Performative::Request, DOCK)
+                if sender == MASTER && receiver.starts_with("payload") =>
+            {
                 let fences = fences_of(message).unwrap_or_default();
-                self.old.get_or_insert_with(|| (receiver.to_owned(), fences));
+                self.old
+                    .get_or_insert_with(|| (receiver.to_owned(), fences));
                 self.send(message, Performative::Confirm, MASTER, &[]).await;
             }
             // The docking is over: its fences are old.
@@ -74,21 +81,39 @@ impl Rogue {
                 // Members that the leader does not want.
                 if let Some(founder) = &self.founder {
                     let words = words::say(&Members {
-                        members: vec![CLIENT.to_owned(), founder.clone(), self.agent.name().to_owned()],
+                        members: vec![
+                            CLIENT.to_owned(),
+                            founder.clone(),
+                            self.agent.name().to_owned(),
+                        ],
                     });
-                    let change = self.agent.message(Performative::Request).receiver(founder.as_str());
-                    let change = change.protocol("fipa-request").conversation_id(self.agent.unique_id());
+                    let change = self
+                        .agent
+                        .message(Performative::Request)
+                        .receiver(founder.as_str());
+                    let change = change
+                        .protocol("fipa-request")
+                        .conversation_id(self.agent.unique_id());
                     self.report("request", founder, change.content(words)).await;
                 }
                 if let Some((item, fences)) = self.old.take() {
                     self.founder.get_or_insert_with(|| item.clone());
-                    self.send(message, Performative::Request, &item, &fences).await;
+                    self.send(message, Performative::Request, &item, &fences)
+                        .await;
                     let content = format!(
                         r#"{{"face":"{item}/a","with":"crex/top","client":"crex","coalition":"crex_stack"}}"#
                     );
-                    let dock = self.agent.message(Performative::Request).receiver(item.as_str());
+                    let dock = self
+                        .agent
+                        .message(Performative::Request)
+                        .receiver(item.as_str());
                     let dock = dock.protocol(DOCK).conversation_id(self.agent.unique_id());
-                    self.report("request", &item, with_fences(dock.content(content), &fences)).await;
+                    self.report(
+                        "request",
+                        &item,
+                        with_fences(dock.content(content), &fences),
+                    )
+                    .await;
                 }
             }
             _ => {}

@@ -83,7 +83,12 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
         .result::<DockResult>();
     let offer = agent.offer(action, move |goal: Dock, run: Execution| {
         let sherpa = Arc::clone(&sherpa);
-        async move { sherpa.dock(goal, &run).await.map_err(|error| error.to_string()) }
+        async move {
+            sherpa
+                .dock(goal, &run)
+                .await
+                .map_err(|error| error.to_string())
+        }
     })?;
     let mut stop = Stop::default();
     while stop.line().await {
@@ -108,9 +113,14 @@ impl Sherpa {
             resources.push(&item);
         }
         let lock = self.agent.lock_all_within(&resources, TIMEOUT).await?;
-        let shown = |name: &str| lock.fence_of(name).map(|fence| (name.to_owned(), fence.to_string()));
+        let shown = |name: &str| {
+            lock.fence_of(name)
+                .map(|fence| (name.to_owned(), fence.to_string()))
+        };
         let fences: BTreeMap<_, _> = resources.iter().filter_map(|name| shown(name)).collect();
-        self.reporter.claim(Claim::Locked { fences: fences.clone() });
+        self.reporter.claim(Claim::Locked {
+            fences: fences.clone(),
+        });
         let words = Docking {
             face,
             with,
@@ -154,7 +164,9 @@ impl Sherpa {
         };
         let found = self.agent.df()?.search(&template).await?;
         let services = found.iter().flat_map(|agent| &agent.services);
-        let pose = services.filter(|it| it.name.as_deref() == Some(item)).find_map(crate::operator::pose);
+        let pose = services
+            .filter(|it| it.name.as_deref() == Some(item))
+            .find_map(crate::operator::pose);
         Ok(pose.ok_or_else(|| format!("no pose of {item} is listed"))?)
     }
 }
@@ -195,7 +207,10 @@ impl Guidance<'_> {
                 return Err("the locks are lost".into());
             }
             let (error, phase) = match self.sight(&mut images).await? {
-                Some(seen) => (seen.sees(Pose::new(0.0, 0.0, std::f64::consts::PI)), "align"),
+                Some(seen) => (
+                    seen.sees(Pose::new(0.0, 0.0, std::f64::consts::PI)),
+                    "align",
+                ),
                 None => {
                     let pose = self.while_partners_live(poses.next()).await??;
                     let pose: Pose = words::hear(pose.message()).ok_or("expected a pose")?;
@@ -203,7 +218,8 @@ impl Guidance<'_> {
                 }
             };
             steps += 1;
-            let is_good = phase == "align" && error.distance() < ALIGNED.0 && error.yaw.abs() < ALIGNED.1;
+            let is_good =
+                phase == "align" && error.distance() < ALIGNED.0 && error.yaw.abs() < ALIGNED.1;
             good = if is_good { good + 1 } else { 0 };
             sherpa.reporter.claim(Claim::Step {
                 conversation: self.conversation.clone(),
@@ -211,8 +227,14 @@ impl Guidance<'_> {
                 phase: phase.to_owned(),
             });
             run.progress(Progress::fraction(if phase == "align" { 0.5 } else { 0.0 }).note(phase));
-            let twist = if good > 0 { Twist::default() } else { Twist::towards(error) };
-            let moved = self.ask(&client, words::say(&Drive { twist }), &client).await?;
+            let twist = if good > 0 {
+                Twist::default()
+            } else {
+                Twist::towards(error)
+            };
+            let moved = self
+                .ask(&client, words::say(&Drive { twist }), &client)
+                .await?;
             if *moved.performative() != Performative::Inform {
                 return Err(format!("{client} refuses: {}", moved.text()).into());
             }
@@ -239,7 +261,9 @@ impl Guidance<'_> {
             conversation: self.conversation.clone(),
         });
         // The launcher stops this process here, once.
-        if sherpa.part.fault == Some(Fault::MasterStopped) && !sherpa.stopped.swap(true, Ordering::Relaxed) {
+        if sherpa.part.fault == Some(Fault::MasterStopped)
+            && !sherpa.stopped.swap(true, Ordering::Relaxed)
+        {
             sherpa.go_on.notified().await;
         }
         let felt = self.ask(item, "latch".to_owned(), client).await?;
@@ -272,7 +296,12 @@ impl Guidance<'_> {
     /// Sends a request, and returns the answer, which comes from `from`.
     async fn ask(&mut self, to: &str, content: String, from: &str) -> Result<Message, Failed> {
         let ask = self.message(Performative::Request, to).content(content);
-        if !self.sherpa.reporter.send(&self.sherpa.agent, self.lock.guard(ask)).await {
+        if !self
+            .sherpa
+            .reporter
+            .send(&self.sherpa.agent, self.lock.guard(ask))
+            .await
+        {
             return Err(format!("{to} cannot be reached").into());
         }
         self.answer(from).await
@@ -332,7 +361,9 @@ impl Guidance<'_> {
     async fn subscribe(&self, to: &str, topic: &str) -> Result<Subscription, Failed> {
         let agent = &self.sherpa.agent;
         let subscribe = agent.message(Performative::Subscribe).receiver(to);
-        Ok(agent.subscribe(subscribe.content(topic.to_owned()), TIMEOUT).await?)
+        Ok(agent
+            .subscribe(subscribe.content(topic.to_owned()), TIMEOUT)
+            .await?)
     }
 
     fn message(&self, act: Performative, to: &str) -> fipa::MessageBuilder {

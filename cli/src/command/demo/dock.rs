@@ -169,7 +169,11 @@ fn say(line: &str) -> Result<(), Failure> {
 }
 
 fn not_written(file: &std::path::Path, error: &std::io::Error) -> Failure {
-    Failure::failed(error.to_string(), file.display().to_string(), "choose a file that can be written")
+    Failure::failed(
+        error.to_string(),
+        file.display().to_string(),
+        "choose a file that can be written",
+    )
 }
 
 fn failed(error: impl ToString) -> Failure {

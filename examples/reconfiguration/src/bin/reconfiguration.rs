@@ -38,7 +38,11 @@ async fn run_part(part: &str) -> Result<bool, Failed> {
 
 async fn run(arguments: &[&str]) -> Result<bool, Failed> {
     let options = Options {
-        fault: arguments.first().filter(|it| **it != "none").map(|it| it.parse()).transpose()?,
+        fault: arguments
+            .first()
+            .filter(|it| **it != "none")
+            .map(|it| it.parse())
+            .transpose()?,
         seed: arguments.get(1).map_or(Ok(1), |seed| seed.parse())?,
         program: launch::own_program(&["part"])?,
         ..Options::default()

@@ -54,11 +54,22 @@ impl World {
     #[must_use]
     pub fn new(seed: u64) -> Self {
         let mut rng = Rng::with_seed(seed);
-        let item = [("a", Pose::new(-0.1, 0.0, std::f64::consts::PI)), ("b", Pose::new(0.1, 0.0, 0.0))];
+        let item = [
+            ("a", Pose::new(-0.1, 0.0, std::f64::consts::PI)),
+            ("b", Pose::new(0.1, 0.0, 0.0)),
+        ];
         let mut bodies = BTreeMap::new();
         for (name, at, sides) in [
-            ("crex", Pose::new(0.0, 0.0, 0.0), &[("top", Pose::new(0.3, 0.0, 0.0))][..]),
-            ("sherpa", Pose::new(3.2, -2.0, 1.5), &[("gripper", Pose::new(0.4, 0.0, 0.0))][..]),
+            (
+                "crex",
+                Pose::new(0.0, 0.0, 0.0),
+                &[("top", Pose::new(0.3, 0.0, 0.0))][..],
+            ),
+            (
+                "sherpa",
+                Pose::new(3.2, -2.0, 1.5),
+                &[("gripper", Pose::new(0.4, 0.0, 0.0))][..],
+            ),
             ("payload_1", Pose::new(1.8, 0.8, 0.3), &item[..]),
             ("payload_2", Pose::new(2.4, -1.0, -0.3), &item[..]),
         ] {
@@ -131,7 +142,9 @@ impl World {
 
     /// Drives a body at this velocity for a short time.
     pub fn drive(&mut self, name: &str, twist: Twist) {
-        let finite = [twist.x, twist.y, twist.yaw].iter().all(|it| it.is_finite());
+        let finite = [twist.x, twist.y, twist.yaw]
+            .iter()
+            .all(|it| it.is_finite());
         if let Some(body) = self.bodies.get_mut(name).filter(|_| finite) {
             body.twist = twist;
             body.until = self.now + DEAD_MAN;
@@ -146,12 +159,19 @@ impl World {
             (seen.x > -0.05 && seen.distance() < SIGHT).then(|| (other.clone(), seen))
         };
         let group = self.joined(&face.body);
-        let others = self.faces().filter(|other| !group.contains(&other.body) && self.is_free(other));
+        let others = self
+            .faces()
+            .filter(|other| !group.contains(&other.body) && self.is_free(other));
         let all = others.filter_map(|other| sees(&other));
-        let (marker, seen) = all.min_by(|(_, left), (_, right)| left.distance().total_cmp(&right.distance()))?;
+        let (marker, seen) =
+            all.min_by(|(_, left), (_, right)| left.distance().total_cmp(&right.distance()))?;
         let mut noise = |scale: f64| (self.rng.f64() * 2.0 - 1.0) * scale;
         let scale = 0.001 + 0.01 * seen.distance();
-        let pose = Pose::new(seen.x + noise(scale), seen.y + noise(scale), seen.yaw + noise(scale));
+        let pose = Pose::new(
+            seen.x + noise(scale),
+            seen.y + noise(scale),
+            seen.yaw + noise(scale),
+        );
         Some(Sight { marker, pose })
     }
 
@@ -163,7 +183,9 @@ impl World {
             let seen = self.at(other).map(|other| turned.sees(other));
             seen.is_some_and(|seen| seen.distance() < REACH && seen.yaw.abs() < TURN)
         };
-        let other = self.faces().find(|other| other.body != face.body && self.is_free(other) && fits(other))?;
+        let other = self
+            .faces()
+            .find(|other| other.body != face.body && self.is_free(other) && fits(other))?;
         let contact = Contact {
             face: face.clone(),
             other,
@@ -184,7 +206,10 @@ impl World {
     pub fn contact(&self, face: &Face) -> Option<&Face> {
         self.contacts.iter().find_map(|contact| match contact {
             Contact { face: it, other } if it == face => Some(other),
-            Contact { face: other, other: it } if it == face => Some(other),
+            Contact {
+                face: other,
+                other: it,
+            } if it == face => Some(other),
             _ => None,
         })
     }
@@ -199,8 +224,13 @@ impl World {
         let Some(here) = self.at(&gripper).filter(|_| close) else {
             return false;
         };
-        let near = |other: &Face| self.at(other).is_some_and(|other| here.sees(other).distance() < GRIP);
-        let found = self.faces().find(|other| other.body != name && other.side == "b" && near(other));
+        let near = |other: &Face| {
+            self.at(other)
+                .is_some_and(|other| here.sees(other).distance() < GRIP)
+        };
+        let found = self
+            .faces()
+            .find(|other| other.body != name && other.side == "b" && near(other));
         self.gripped = found.map(|other| (name.to_owned(), other.body));
         self.gripped.is_some()
     }
@@ -217,7 +247,9 @@ impl World {
 
     fn at(&self, face: &Face) -> Option<Pose> {
         let body = self.bodies.get(&face.body)?;
-        body.sides.get(face.side.as_str()).map(|side| body.pose.then(*side))
+        body.sides
+            .get(face.side.as_str())
+            .map(|side| body.pose.then(*side))
     }
 
     fn is_free(&self, face: &Face) -> bool {
@@ -229,8 +261,14 @@ impl World {
         let mut group = vec![name.to_owned()];
         let mut at = 0;
         while let Some(from) = group.get(at).cloned() {
-            let latched = self.contacts.iter().map(|it| (it.face.body.as_str(), it.other.body.as_str()));
-            let gripped = self.gripped.iter().map(|(one, other)| (one.as_str(), other.as_str()));
+            let latched = self
+                .contacts
+                .iter()
+                .map(|it| (it.face.body.as_str(), it.other.body.as_str()));
+            let gripped = self
+                .gripped
+                .iter()
+                .map(|(one, other)| (one.as_str(), other.as_str()));
             for (one, other) in latched.chain(gripped) {
                 let next = match from.as_str() {
                     from if from == one => other,
@@ -282,7 +320,10 @@ mod tests {
         let mut world = World::new(2);
         approach(&mut world, "payload_1/a", 0.0);
         world.latch(&face("payload_1/a")).unwrap();
-        let before = world.pose("crex").unwrap().sees(world.pose("payload_1").unwrap());
+        let before = world
+            .pose("crex")
+            .unwrap()
+            .sees(world.pose("payload_1").unwrap());
         let start = world.pose("crex").unwrap();
         let twist = Twist {
             x: 1.0,
@@ -291,7 +332,10 @@ mod tests {
         };
         world.drive("crex", twist);
         world.advance(10.0);
-        let after = world.pose("crex").unwrap().sees(world.pose("payload_1").unwrap());
+        let after = world
+            .pose("crex")
+            .unwrap()
+            .sees(world.pose("payload_1").unwrap());
         assert!(before.sees(after).distance() < 1e-9);
         let way = start.sees(world.pose("crex").unwrap()).distance();
         assert!((way - DEAD_MAN).abs() < 1e-9, "{way}");

@@ -1,0 +1,137 @@
+//! Whole runs with real processes: without a fault, with each fault, with random ones, and with a defect that the checker
+//! has to find.
+
+#![expect(clippy::unwrap_used, reason = "a panic fails the test")]
+
+use fipa_reconfiguration::Fault;
+use fipa_reconfiguration::launch::{self, Link, Options, Outcome};
+use fipa_reconfiguration::part::Mutant;
+use fipa_reconfiguration::picture;
+use fipa_reconfiguration::report::Claim;
+
+/// A run of the program of this package.
+fn options(fault: Option<Fault>, seed: u64) -> Options {
+    Options {
+        fault,
+        seed,
+        program: vec![env!("CARGO_BIN_EXE_reconfiguration").into(), "part".into()],
+        ..Options::default()
+    }
+}
+
+async fn run(options: Options) -> Outcome {
+    launch::run(&options, &mut |_| {}).await.unwrap()
+}
+
+/// Runs with a fault, and expects a consistent end.
+async fn consistent(fault: Option<Fault>, seed: u64) -> Outcome {
+    let outcome = run(options(fault, seed)).await;
+    assert!(
+        outcome.failed.is_empty(),
+        "{fault:?}, seed {seed}: {:?}",
+        outcome.failed
+    );
+    assert!(!outcome.passed.is_empty());
+    outcome
+}
+
+/// Runs with a defect, and expects that the checker finds it.
+async fn found(mutant: Mutant, fault: Option<Fault>) {
+    let options = Options {
+        mutant: Some(mutant),
+        ..options(fault, 3)
+    };
+    let outcome = run(options).await;
+    assert!(!outcome.failed.is_empty(), "{mutant:?} was not found");
+}
+
+#[tokio::test]
+async fn two_robots_become_one() {
+    let outcome = consistent(None, 1).await;
+    let docked = outcome
+        .reports
+        .iter()
+        .filter(|it| matches!(it.claim, Claim::Docked { .. }));
+    assert_eq!(docked.count(), 2);
+    let drawn = picture::page(&outcome.reports).svg();
+    for text in ["payload_2", "crex_stack, leader", "sherpa #1", "confirm"] {
+        assert!(drawn.contains(text), "{text}");
+    }
+}
+
+#[tokio::test]
+async fn the_item_is_killed() {
+    consistent(Some(Fault::ItemKilled), 2).await;
+}
+
+#[tokio::test]
+async fn the_link_is_cut() {
+    consistent(Some(Fault::LinkCut), 3).await;
+}
+
+#[tokio::test]
+async fn the_master_is_stopped() {
+    consistent(Some(Fault::MasterStopped), 4).await;
+}
+
+#[tokio::test]
+async fn an_agent_breaks_the_rules() {
+    consistent(Some(Fault::Rogue), 5).await;
+}
+
+#[tokio::test]
+async fn the_operator_cancels() {
+    consistent(Some(Fault::Cancel), 6).await;
+}
+
+#[tokio::test]
+async fn random_faults() {
+    for seed in 7..10 {
+        consistent(Some(Fault::random(seed)), seed).await;
+    }
+}
+
+/// The delay is in each step of the guidance.
+#[tokio::test]
+async fn a_slow_link() {
+    let link = Link {
+        delay: std::time::Duration::from_millis(50),
+        rate: Some(10e6 / 8.0),
+    };
+    let outcome = run(Options {
+        link,
+        ..options(None, 1)
+    });
+    let outcome = outcome.await;
+    assert!(outcome.failed.is_empty(), "{:?}", outcome.failed);
+}
+
+#[tokio::test]
+async fn unchecked_fences_are_found() {
+    found(Mutant::FencesUnchecked, None).await;
+}
+
+#[tokio::test]
+async fn letters_that_are_not_checked_are_found() {
+    found(Mutant::EnforcementOff, Some(Fault::Rogue)).await;
+}
+
+#[tokio::test]
+async fn a_lock_that_is_skipped_is_found() {
+    found(Mutant::LockSkipped, None).await;
+}
+
+#[tokio::test]
+async fn a_leader_without_a_fence_is_found() {
+    found(Mutant::LeaderNotFenced, Some(Fault::Rogue)).await;
+}
+
+#[tokio::test]
+async fn a_reservation_that_is_kept_is_found() {
+    found(Mutant::ReservationKept, Some(Fault::ItemKilled)).await;
+}
+
+#[tokio::test]
+async fn an_invented_report_is_found() {
+    found(Mutant::ReportInvented, None).await;
+}
