@@ -116,7 +116,7 @@ async fn publish(poses: Publisher, mut encoder: Hardware, stack: Stack) -> Resul
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
     loop {
         ticks.tick().await;
-        let front = front(&*stack.lock().await);
+        let front = front(&stack.lock().await);
         let pose = encoder.encoder().await?.then(front);
         poses.publish(words::say(&pose)).await;
     }
@@ -210,7 +210,7 @@ impl Crex<'_> {
             self.answer(message, Performative::Refuse, reason).await;
             return Ok(());
         }
-        let front = front(&*self.stack.lock().await);
+        let front = front(&self.stack.lock().await);
         self.hardware.drive(twist.of_body(front)).await?;
         let pose = self.hardware.encoder().await?.then(front);
         self.answer(message, Performative::Inform, words::say(&pose))
@@ -273,10 +273,17 @@ impl Crex<'_> {
 
     /// The coalition may have other members, or another leader.
     fn changed(&mut self, state: &CoalitionState) {
-        if self.members != state.members {
-            self.members.clone_from(&state.members);
-            self.reporter.coalition(COALITION, state);
+        if self.members == state.members {
+            return;
         }
+        self.members.clone_from(&state.members);
+        let members = self.members.as_ref();
+        let names = members.map(|it| it.names().iter().map(ToString::to_string).collect());
+        self.reporter.claim(Claim::Coalition {
+            name: COALITION.to_owned(),
+            members: names.unwrap_or_default(),
+            leader: members.and_then(|it| it.leader()).map(ToString::to_string),
+        });
     }
 
     /// Ends the docking.

@@ -14,9 +14,6 @@ use crate::geometry::{Pose, Twist};
 /// Length of the image of a camera, in bytes.
 pub const IMAGE: usize = 1_000_000;
 
-/// Length of the part of an image that has the sight, in bytes: a length (u16, big-endian), then JSON.
-const HEADER: usize = 512;
-
 /// A question or a command to the hardware, one JSON document in a line.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -51,24 +48,12 @@ pub struct Sight {
 }
 
 impl Sight {
-    /// Finds the marker in an image.
+    /// Finds the marker in an image, which begins with a length (u16, big-endian) and as many bytes of JSON.
     #[must_use]
     pub fn find(image: &[u8]) -> Option<Self> {
         let (len, rest) = image.split_first_chunk::<2>()?;
         let header = rest.get(..usize::from(u16::from_be_bytes(*len)))?;
         serde_json::from_slice(header).ok()
-    }
-
-    /// Writes what the camera sees into the header of the image.
-    pub(crate) fn write(sight: Option<&Self>, image: &mut [u8]) {
-        let header = sight.and_then(|sight| serde_json::to_vec(sight).ok());
-        let header = header.filter(|it| it.len() <= HEADER).unwrap_or_default();
-        let len = u16::try_from(header.len())
-            .unwrap_or_default()
-            .to_be_bytes();
-        for (byte, value) in image.iter_mut().zip(len.into_iter().chain(header)) {
-            *byte = value;
-        }
     }
 }
 
@@ -216,25 +201,4 @@ impl Hardware {
 
 fn unexpected<T>(answer: &Answer) -> Result<T, HardwareError> {
     Err(HardwareError::Unexpected(format!("{answer:?}")))
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
-
-    use super::*;
-
-    #[test]
-    fn an_image_has_what_the_camera_sees() {
-        let sight = Sight {
-            marker: String::from("crex/top").try_into().unwrap(),
-            pose: Pose::new(0.1, -0.2, 3.0),
-        };
-        let mut image = vec![0x7f; IMAGE];
-        Sight::write(Some(&sight), &mut image);
-        assert_eq!(Sight::find(&image), Some(sight));
-        Sight::write(None, &mut image);
-        assert_eq!(Sight::find(&image), None);
-        assert_eq!(Sight::find(&[]), None);
-    }
 }

@@ -161,7 +161,8 @@ impl Operator<'_> {
             self.award(first, net_1, bids_1, to_first),
             self.award(second, net_2, bids_2, to_second)
         );
-        (one?, two?);
+        one?;
+        two?;
         let mut order = vec![first.clone(), second.clone()];
         if to_first != CLIENT {
             order.reverse();

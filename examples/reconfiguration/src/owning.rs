@@ -22,9 +22,10 @@ fn own_options() -> OwnOptions {
 
 /// The options of the coalition.
 pub(crate) fn coalition_options() -> CoalitionOptions {
-    let mut options = CoalitionOptions::default();
-    options.lock = own_options();
-    options
+    CoalitionOptions {
+        lock: own_options(),
+        ..CoalitionOptions::default()
+    }
 }
 
 /// Owns two resources, and reports their grants. `ended` is notified at the end of each.

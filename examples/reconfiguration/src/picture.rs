@@ -258,7 +258,7 @@ impl<'a> Run<'a> {
             .map(|it| it.at);
         let (from, to) = (
             times.next().unwrap_or_default(),
-            times.last().unwrap_or_default(),
+            times.next_back().unwrap_or_default(),
         );
         let agents: BTreeSet<&str> = BODIES.into_iter().collect();
         let steps = self

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::io::Write as _;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use fipa::coalitions::CoalitionState;
 use fipa::error::ErrorChain;
 use fipa::locks::{AdmitError, Fence, OwnerEvent};
 use fipa::{Agent, MessageBuilder};
@@ -219,17 +218,6 @@ impl Reporter {
             }),
             other => self.noticed(format!("{resource}: {other:?}")),
         }
-    }
-
-    /// Reports a coalition as a member sees it.
-    pub(crate) fn coalition(&self, name: &str, state: &CoalitionState) {
-        let members = state.members.as_ref();
-        let names = members.map(|it| it.names().iter().map(ToString::to_string).collect());
-        self.claim(Claim::Coalition {
-            name: name.to_owned(),
-            members: names.unwrap_or_default(),
-            leader: members.and_then(|it| it.leader()).map(ToString::to_string),
-        });
     }
 
     /// Reports whether a command is obeyed. Returns the reason if it is not.

@@ -5,11 +5,13 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::face::Face;
+#[cfg(feature = "robots")]
 use crate::geometry::{Pose, Twist};
 
 /// The name of the protocol of a docking, `dock.scxml`.
 pub(crate) const DOCK: &str = "dock";
 
+#[cfg(feature = "robots")]
 /// The topic of the pose of a free interface, in meters and radians.
 pub(crate) const POSE: &str = "pose";
 
@@ -29,6 +31,7 @@ pub(crate) struct Docking {
     pub(crate) coalition: String,
 }
 
+#[cfg(feature = "robots")]
 /// The master guides the client.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Drive {
@@ -36,6 +39,7 @@ pub(crate) struct Drive {
     pub(crate) twist: Twist,
 }
 
+#[cfg(feature = "robots")]
 /// The operator calls for proposals to fetch an item.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Fetch {

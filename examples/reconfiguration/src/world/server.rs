@@ -119,9 +119,35 @@ fn answer(server: &Server, name: &str, ask: Ask) -> (Answer, Option<Vec<u8>>) {
     (answer, None)
 }
 
-/// Draws what a camera sees.
+/// Draws what a camera sees; see [`Sight::find`].
 fn image(sight: Option<&Sight>) -> Vec<u8> {
-    let mut image = vec![0x7f; IMAGE];
-    Sight::write(sight, &mut image);
+    let sight = sight.and_then(|sight| serde_json::to_vec(sight).ok());
+    let sight = sight.unwrap_or_default();
+    let mut image = u16::try_from(sight.len())
+        .unwrap_or_default()
+        .to_be_bytes()
+        .to_vec();
+    image.extend(sight);
+    image.resize(IMAGE, 0x7f);
     image
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+
+    use super::*;
+    use crate::geometry::Pose;
+
+    #[test]
+    fn an_image_has_what_the_camera_sees() {
+        let sight = Sight {
+            marker: String::from("crex/top").try_into().unwrap(),
+            pose: Pose::new(0.1, -0.2, 3.0),
+        };
+        let drawn = image(Some(&sight));
+        assert_eq!((drawn.len(), Sight::find(&drawn)), (IMAGE, Some(sight)));
+        assert_eq!(Sight::find(&image(None)), None);
+        assert_eq!(Sight::find(&[]), None);
+    }
 }
