@@ -133,7 +133,6 @@ async fn look(task: Task, agent: Agent, stack: Stack, reporter: Reporter) -> Res
     let Some(of) = stack.lock().await.last().cloned() else {
         return Ok(Reply::Refuse("no item is docked".into()));
     };
-    let _ = &task;
     let subscribe = agent.message(Performative::Subscribe).receiver(of.as_str());
     let mut images = agent.subscribe(subscribe.content(IMAGES), TIMEOUT).await?;
     let image = images.next().await?;
