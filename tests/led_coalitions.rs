@@ -150,6 +150,26 @@ async fn members_lead_in_their_order_and_refuse_the_commands_of_earlier_leaders(
     there.close().await;
 }
 
+/// The founder may not have listed the leader when it resigns.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_next_member_leads_after_a_leader_that_resigns_at_once() {
+    let domain = Domain::open(&config(&[])).await.unwrap();
+    let item = domain.register("item").await.unwrap();
+    let (crex, arm) = (
+        domain.register("crex").await.unwrap(),
+        domain.register("arm").await.unwrap(),
+    );
+    for robot in ["robot_1", "robot_2", "robot_3"] {
+        let _robot = found(&item, robot, &["crex", "arm"]).await;
+        let in_crex = crex.join_coalition(robot).unwrap();
+        in_crex.leads().await.unwrap();
+        let in_arm = arm.join_coalition(robot).unwrap();
+        in_crex.resign();
+        in_arm.leads().await.unwrap();
+    }
+    domain.close().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_letter_to_a_vacant_coalition_fails_at_its_deadline_or_with_the_coalition() {
     let domain = Domain::open(&config(&[])).await.unwrap();

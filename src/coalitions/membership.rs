@@ -353,8 +353,11 @@ impl Member {
         Some(self.not_before.map_or(turn, |earliest| turn.max(earliest)))
     }
 
-    /// Leads with this lock.
-    fn lead(&self, lock: Lock) {
+    /// Leads with this lock. If the lock is released before the founder has listed this agent, the others are asked
+    /// first nevertheless.
+    fn lead(&mut self, lock: Lock) {
+        self.last_leader = Some(Arc::clone(&self.core.endpoint.name));
+        self.vacant_since = None;
         if let Some(fence) = lock.fence() {
             let mut slot = self.admitted.lock();
             let known = slot.take().filter(|it| *it.owner == *fence.owner());
