@@ -453,7 +453,7 @@ impl Recording {
         };
         let expected: &[&str] = match self.fault().as_str() {
             "item-killed" => &["is gone"],
-            "link-cut" => &["is unreachable"],
+            "link-cut" => &["unreachable"],
             "master-stopped" => &["is stale"],
             "cancel" => &["cancelled"],
             "rogue" => &[

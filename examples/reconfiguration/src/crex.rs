@@ -129,7 +129,12 @@ fn front(stack: &[String]) -> Pose {
 }
 
 /// Looks with the camera of the last item: it is a part of the merged robot now.
-async fn look(task: Task, agent: Agent, stack: Stack, reporter: Reporter) -> Result<Reply, Failed> {
+async fn look(
+    _task: Task,
+    agent: Agent,
+    stack: Stack,
+    reporter: Reporter,
+) -> Result<Reply, Failed> {
     let Some(of) = stack.lock().await.last().cloned() else {
         return Ok(Reply::Refuse("no item is docked".into()));
     };

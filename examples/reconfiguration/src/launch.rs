@@ -19,6 +19,7 @@ use crate::part::{Failed, Mutant, Part, Role};
 pub use crate::relay::Link;
 use crate::relay::Relay;
 use crate::report::{Claim, Report, now};
+use crate::telling::told;
 use crate::{Fault, PROTOCOL};
 
 /// Maximum time for a process to start or end.
@@ -200,7 +201,13 @@ impl Run<'_> {
     /// Whether the fault is to be caused after this report.
     fn is_time(&self, fault: Fault, report: &Report) -> bool {
         match (fault, &report.claim) {
-            (Fault::LinkCut, Claim::Step { .. }) => true,
+            (Fault::LinkCut, Claim::Step { .. }) => {
+                let steps = self
+                    .all
+                    .iter()
+                    .filter(|it| matches!(it.claim, Claim::Step { .. }));
+                steps.count() as u64 > self.options.seed % 30
+            }
             (Fault::MasterStopped, Claim::Aligned { .. }) => true,
             // The second docking: the item is in the gripper.
             (Fault::ItemKilled, Claim::Step { phase, .. }) => {
@@ -434,10 +441,18 @@ impl Run<'_> {
         until: Instant,
         show: &mut dyn FnMut(&Report),
     ) -> Result<Report, Failed> {
-        let report = timeout_at(until, self.reports.recv()).await;
-        let report = report
-            .map_err(|_| "the run has not ended in time")?
-            .ok_or("no process runs")?;
+        let Ok(report) = timeout_at(until, self.reports.recv()).await else {
+            let lines: Vec<String> = self.all.iter().filter_map(told).collect();
+            let last = lines
+                .get(lines.len().saturating_sub(8)..)
+                .unwrap_or_default();
+            return Err(format!(
+                "the run has not ended in time; the last reports:\n{}",
+                last.join("\n")
+            )
+            .into());
+        };
+        let report = report.ok_or("no process runs")?;
         self.record(report.clone(), show)?;
         match &report.claim {
             Claim::Broken { error } => Err(format!("{}: {error}", report.by).into()),

@@ -1,7 +1,7 @@
 //! The program of the operator: it asks for a stack of two items on a robot.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fipa::platform::{AgentDescription, ServiceDescription};
 use fipa::protocol::ContractNet;
@@ -210,7 +210,9 @@ impl Operator<'_> {
         loop {
             match self.attempt(guide, &goal).await {
                 Ok(_) => return Ok(()),
-                Err(error) if attempt == ATTEMPTS || self.gives_up(item) => return Err(error),
+                Err(error) if attempt == ATTEMPTS || self.gives_up(item).await => {
+                    return Err(error);
+                }
                 Err(error) => self
                     .reporter
                     .noticed(format!("attempt {attempt} to dock {item}: {error}")),
@@ -220,9 +222,17 @@ impl Operator<'_> {
     }
 
     /// Whether no further attempt can succeed, or the operator wants none.
-    fn gives_up(&self, item: &str) -> bool {
-        let is_gone = self.agent.domain().directory().lookup(item).is_none();
-        is_gone || self.part.fault == Some(Fault::Cancel)
+    async fn gives_up(&self, item: &str) -> bool {
+        let directory = self.agent.domain().directory();
+        let until = Instant::now() + TIMEOUT;
+        // The host of the item may be silent, and return.
+        while directory.lookup(item).is_none()
+            && directory.lost_agent(item).is_some()
+            && Instant::now() < until
+        {
+            tokio::time::sleep(PAUSE).await;
+        }
+        directory.lookup(item).is_none() || self.part.fault == Some(Fault::Cancel)
     }
 
     async fn attempt(&self, guide: &AgentId, goal: &Dock) -> Result<DockResult, Failed> {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use fipa::actions::{Action, Execution, Progress};
 use fipa::locks::Lock;
@@ -12,7 +12,8 @@ use fipa::platform::{AgentDescription, ServiceDescription};
 use fipa::protocol::{PartnerEvent, PartnerWatch, Subscription};
 use fipa::{Agent, Domain, Message, Performative};
 use serde::{Deserialize, Serialize};
-use tokio::sync::Notify;
+use tokio::sync::{Mutex, Notify, mpsc};
+use tokio::time::Instant;
 
 use crate::face::{Contact, Face};
 use crate::fetching::{self, Way};
@@ -29,6 +30,8 @@ pub(crate) const SERVICE: &str = "guide";
 const GRIPPER: Pose = Pose::new(0.4, 0.0, 0.0);
 /// Maximum error of the position before the latch, in meters, and of the angle, in radians.
 const ALIGNED: (f64, f64) = (0.005, 0.02);
+/// Number of letters that wait for a docking.
+const INBOX: usize = 64;
 /// Maximum wait for locks and answers.
 const TIMEOUT: Duration = Duration::from_secs(20);
 
@@ -56,6 +59,8 @@ struct Sherpa {
     /// The launcher lets a stopped master go on.
     go_on: Arc<Notify>,
     stopped: AtomicBool,
+    /// The letters of the docking protocol.
+    inbox: Mutex<mpsc::Receiver<Message>>,
 }
 
 /// Runs the program.
@@ -66,13 +71,16 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
     let guide = ServiceDescription::new("guide", SERVICE);
     agent.df()?.register_service(guide).await?;
     let go_on = Arc::new(Notify::new());
+    let (letters, inbox) = mpsc::channel(INBOX);
+    let reporter = Reporter::new(&part.name);
     let sherpa = Arc::new(Sherpa {
         part: part.clone(),
         agent: agent.clone(),
-        reporter: Reporter::new(&part.name),
+        reporter: reporter.clone(),
         world: part.world.clone(),
         go_on: Arc::clone(&go_on),
         stopped: AtomicBool::new(false),
+        inbox: Mutex::new(inbox),
     });
     sherpa.reporter.claim(Claim::Ready);
     let action = Action::new("dock")
@@ -91,8 +99,23 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
         }
     })?;
     let mut stop = Stop::default();
-    while stop.line().await {
-        go_on.notify_one();
+    // All letters are received, so that those of a docking that has ended do not fill the queue of the agent.
+    loop {
+        tokio::select! {
+            goes_on = stop.line() => match goes_on {
+                true => go_on.notify_one(),
+                false => break,
+            },
+            incoming = agent.receive() => {
+                let incoming = incoming?;
+                match incoming.violation() {
+                    Some(violation) => reporter.noticed(violation),
+                    // A letter that finds no room is not awaited: the docking has ended.
+                    None if incoming.message().protocol() == Some(DOCK) => drop(letters.try_send(incoming.into_message())),
+                    None => {}
+                }
+            }
+        }
     }
     drop((offer, fetching, agent));
     domain.close().await;
@@ -309,22 +332,18 @@ impl Guidance<'_> {
 
     /// Waits for the next message of an agent in this conversation.
     async fn answer(&mut self, from: &str) -> Result<Message, Failed> {
-        let agent = self.sherpa.agent.clone();
-        let until = tokio::time::Instant::now() + TIMEOUT;
+        let sherpa = self.sherpa;
+        let until = Instant::now() + TIMEOUT;
         loop {
-            let next = tokio::time::timeout_at(until, agent.receive());
-            let Ok(incoming) = self.while_partners_live(next).await? else {
+            let mut inbox = sherpa.inbox.lock().await;
+            let next = tokio::time::timeout_at(until, inbox.recv());
+            let Ok(message) = self.while_partners_live(next).await? else {
                 return Err(format!("{from} does not answer").into());
             };
-            let incoming = incoming?;
-            if let Some(violation) = incoming.violation() {
-                self.sherpa.reporter.noticed(violation);
-                continue;
-            }
-            let message = incoming.message();
+            let message = message.ok_or("the program ends")?;
             let sender = message.sender().map(fipa::AgentId::name);
             if message.conversation_id() == Some(&self.conversation) && sender == Some(from) {
-                return Ok(message.clone());
+                return Ok(message);
             }
         }
     }

@@ -14,7 +14,7 @@ const REACH: f64 = 0.008;
 /// Maximum error of the angle at which an interface latches, in radians.
 const TURN: f64 = 0.05;
 /// Maximum error of the position at which the gripper holds an item, in meters.
-const GRIP: f64 = 0.05;
+const GRIP: f64 = 0.1;
 /// Maximum distance at which a camera sees another interface, in meters.
 const SIGHT: f64 = 1.2;
 /// A motor stops this long after its last command, in seconds.
