@@ -81,7 +81,7 @@ fn free(locks: &[ResourceStatus]) -> Result<(), String> {
         Some(lock) => Err(format!(
             "{} is held by {}",
             lock.resource,
-            lock.holder.as_deref().unwrap_or("nobody")
+            lock.holder.as_deref().unwrap_or_default()
         )),
     }
 }
@@ -441,7 +441,7 @@ impl Recording {
             .unwrap_or_default()
     }
 
-    /// Somebody who can see it reports the fault.
+    /// An agent that can see the fault reports it.
     fn noticed(&self) -> Result<(), String> {
         let says = |words: &str| {
             let all = self.all(|claim| match claim {
@@ -466,7 +466,7 @@ impl Recording {
         };
         match expected.iter().find(|words| !says(words)) {
             None => Ok(()),
-            Some(words) => Err(format!("nobody reports {words:?}")),
+            Some(words) => Err(format!("no agent reports {words:?}")),
         }
     }
 }

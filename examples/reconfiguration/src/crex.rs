@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use fipa::coalitions::{CoalitionState, Membership};
 use fipa::locks::Owned;
-use fipa::protocol::{PartnerEvent, PartnerWatch, Reply, Task};
+use fipa::protocol::{Reply, Task};
 use fipa::topics::{Publisher, Topic};
 use fipa::{Agent, Domain, Message, Performative};
 use tokio::sync::Mutex;
@@ -16,9 +16,10 @@ use crate::fetching::{self, Way};
 use crate::geometry::Pose;
 use crate::hardware::{Hardware, Sight};
 use crate::owning::own_all;
-use crate::part::{Failed, Mutant, Part, Stop};
+use crate::part::{Failed, Part, Stop};
 use crate::report::{Claim, Reporter};
-use crate::words::{self, DOCK, Docking, Drive, IMAGES, Members, POSE};
+use crate::taking_part::{Event, Open, Side};
+use crate::words::{self, Drive, IMAGES, Members, POSE};
 
 /// The pose of its interface at its body.
 const TOP: Pose = Pose::new(0.3, 0.0, 0.0);
@@ -33,24 +34,13 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 type Stack = Arc<Mutex<Vec<String>>>;
 
 struct Crex<'a> {
-    part: &'a Part,
-    agent: Agent,
-    reporter: Reporter,
+    side: Side<'a>,
     hardware: Hardware,
     drive: Arc<Owned>,
-    partners: PartnerWatch,
     membership: Membership,
     /// The members as they were reported last.
     members: Option<fipa::Members>,
     stack: Stack,
-    docking: Option<Client>,
-}
-
-/// A docking in which it is the client.
-struct Client {
-    conversation: String,
-    master: String,
-    words: Docking,
 }
 
 /// Runs the program.
@@ -78,29 +68,20 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
     reporter.claim(Claim::Ready);
 
     let mut crex = Crex {
-        part,
-        partners: agent.watch_partners(),
-        agent,
-        reporter,
+        side: Side::new(part, agent, reporter),
         hardware: Hardware::connect(&part.world, &part.name).await?,
         drive,
         membership,
         members: None,
         stack,
-        docking: None,
     };
     let mut stop = Stop::default();
     loop {
         tokio::select! {
-            incoming = crex.agent.receive() => {
-                let incoming = incoming?;
-                match incoming.violation() {
-                    Some(violation) => crex.reporter.noticed(violation),
-                    None if incoming.message().protocol() == Some(DOCK) => crex.handle(incoming.message()).await?,
-                    None => {}
-                }
-            }
-            event = crex.partners.next() => crex.partner(event).await?,
+            event = crex.side.next() => match event? {
+                Event::Letter(message) => crex.handle(&message).await?,
+                Event::Gone(agent) => crex.end(&format!("{agent} is gone")).await?,
+            },
             state = crex.membership.changed() => crex.changed(&state?),
             () = stop.requested() => break,
         }
@@ -155,13 +136,15 @@ async fn look(
 
 impl Crex<'_> {
     async fn handle(&mut self, message: &Message) -> Result<(), Failed> {
-        let conversation = message.conversation_id().unwrap_or_default();
-        let open = self
-            .docking
-            .as_ref()
-            .filter(|it| it.conversation == conversation);
-        match (message.performative(), open.is_some()) {
-            (Performative::Request, false) => self.begin(message).await,
+        match (message.performative(), self.side.is_open(message)) {
+            (Performative::Request, false) => {
+                // Its motors obey the holder of their lock.
+                let drive = Arc::clone(&self.drive);
+                let begun = self
+                    .side
+                    .begin(message, |_| Some(&*drive), |words| &words.face.body);
+                begun.await;
+            }
             (Performative::Request, true) => self.drive(message).await?,
             (Performative::Inform, true) => self.feel().await?,
             (Performative::Failure, true) => {
@@ -169,7 +152,8 @@ impl Crex<'_> {
             }
             (Performative::Cancel, _) => {
                 self.end("cancelled").await?;
-                self.answer(message, Performative::Inform, "stopped".into())
+                self.side
+                    .answer(message, Performative::Inform, "stopped")
                     .await;
             }
             _ => {}
@@ -177,58 +161,36 @@ impl Crex<'_> {
         Ok(())
     }
 
-    /// Agrees to be guided by the holder of its motors' lock.
-    async fn begin(&mut self, message: &Message) {
-        let Some(words) = words::hear::<Docking>(message) else {
-            return self
-                .answer(message, Performative::Refuse, "expected a docking".into())
-                .await;
-        };
-        if let Err(reason) = self.admit(message, "dock") {
-            return self.answer(message, Performative::Refuse, reason).await;
-        }
-        let master = message
-            .sender()
-            .map(|id| id.name().to_owned())
-            .unwrap_or_default();
-        for agent in [&master, &words.face.body] {
-            self.partners.add(agent);
-        }
-        self.docking = Some(Client {
-            conversation: message.conversation_id().unwrap_or_default().to_owned(),
-            master,
-            words,
-        });
-        self.answer(message, Performative::Agree, String::new())
-            .await;
-    }
-
     /// Moves its free interface at the velocity that the master wants.
     async fn drive(&mut self, message: &Message) -> Result<(), Failed> {
         let Some(Drive { twist }) = words::hear(message) else {
-            self.answer(message, Performative::Refuse, "expected a velocity".into())
+            self.side
+                .answer(message, Performative::Refuse, "expected a velocity")
                 .await;
             return Ok(());
         };
-        if let Err(reason) = self.admit(message, "drive") {
-            self.answer(message, Performative::Refuse, reason).await;
+        if let Err(reason) = self.side.admit(message, &self.drive, "drive") {
+            self.side
+                .answer(message, Performative::Refuse, reason)
+                .await;
             return Ok(());
         }
         let front = front(&self.stack.lock().await);
         self.hardware.drive(twist.of_body(front)).await?;
         let pose = self.hardware.encoder().await?.then(front);
-        self.answer(message, Performative::Inform, words::say(&pose))
+        self.side
+            .answer(message, Performative::Inform, words::say(&pose))
             .await;
         Ok(())
     }
 
     /// The item has latched: confirms if the interface feels it.
     async fn feel(&mut self) -> Result<(), Failed> {
-        let Some(Client { words, .. }) = &self.docking else {
+        let Some(Open { words, .. }) = &self.side.docking else {
             return Ok(());
         };
         let (face, with, words) = (words.face.clone(), words.with.clone(), words.clone());
-        let felt = match with.body == self.part.name {
+        let felt = match with.body == self.side.part.name {
             true => self.hardware.contact(&with.side).await? == Some(face.clone()),
             // The interface is that of an item, which its own program asks.
             false => true,
@@ -240,11 +202,11 @@ impl Crex<'_> {
             return Ok(());
         }
         let contact = Contact { face, other: with };
-        self.reporter.claim(Claim::Confirmed {
+        self.side.reporter.claim(Claim::Confirmed {
             contact: contact.clone(),
         });
         self.tell(Performative::Confirm, "").await;
-        self.docking = None;
+        self.side.end();
         self.joined(&words.face).await;
         Ok(())
     }
@@ -256,22 +218,27 @@ impl Crex<'_> {
         let [founder, _, ..] = stack.as_slice() else {
             return;
         };
-        let (founder, mut members) = (founder.clone(), vec![self.part.name.clone()]);
+        let (founder, mut members) = (founder.clone(), vec![self.side.part.name.clone()]);
         members.extend(stack.iter().cloned());
         drop(stack);
-        let ask = self.agent.message(Performative::Request).receiver(founder);
+        let ask = self
+            .side
+            .agent
+            .message(Performative::Request)
+            .receiver(founder);
         let ask = ask.content(words::say(&Members { members }));
         let asked = async {
             // It leads as soon as the first item has founded the coalition.
             tokio::time::timeout(TIMEOUT, self.membership.leads()).await??;
             let request = self
+                .side
                 .agent
                 .request(self.membership.guard(ask)?, TIMEOUT)
                 .await?;
             Ok::<_, Failed>(request.result().await?)
         };
         if let Err(error) = asked.await {
-            self.reporter.noticed(error);
+            self.side.reporter.noticed(error);
         }
     }
 
@@ -283,7 +250,7 @@ impl Crex<'_> {
         self.members.clone_from(&state.members);
         let members = self.members.as_ref();
         let names = members.map(|it| it.names().iter().map(ToString::to_string).collect());
-        self.reporter.claim(Claim::Coalition {
+        self.side.reporter.claim(Claim::Coalition {
             name: COALITION.to_owned(),
             members: names.unwrap_or_default(),
             leader: members.and_then(|it| it.leader()).map(ToString::to_string),
@@ -293,50 +260,18 @@ impl Crex<'_> {
     /// Ends the docking.
     async fn end(&mut self, why: &str) -> Result<(), Failed> {
         self.hardware.stop().await?;
-        if let Some(docking) = self.docking.take() {
-            for agent in [&docking.master, &docking.words.face.body] {
-                self.partners.remove(agent);
-            }
-            self.reporter
+        if self.side.end().is_some() {
+            self.side
+                .reporter
                 .noticed(format!("the docking has ended: {why}"));
         }
         Ok(())
     }
 
-    async fn partner(&mut self, event: PartnerEvent) -> Result<(), Failed> {
-        match event {
-            PartnerEvent::Gone { agent } => self.end(&format!("{agent} is gone")).await?,
-            PartnerEvent::Unreachable { agent, .. } => {
-                self.reporter.noticed(format!("{agent} is unreachable"))
-            }
-            _ => {}
-        }
-        Ok(())
-    }
-
-    fn admit(&self, message: &Message, action: &str) -> Result<(), String> {
-        if self.part.has(Mutant::FencesUnchecked) {
-            return Ok(());
-        }
-        let resource = self.drive.resource();
-        self.reporter
-            .admission(action, resource, self.drive.check(message))
-    }
-
     /// Tells the master of the docking.
     async fn tell(&self, act: Performative, content: &str) {
-        let Some(docking) = &self.docking else {
-            return;
-        };
-        let tell = self.agent.message(act).receiver(docking.master.as_str());
-        let tell = tell.protocol(DOCK).conversation_id(&docking.conversation);
-        self.reporter
-            .send(&self.agent, tell.content(content.to_owned()))
-            .await;
-    }
-
-    async fn answer(&self, message: &Message, act: Performative, content: String) {
-        let answer = self.agent.reply(message, act).content(content);
-        self.reporter.send(&self.agent, answer).await;
+        if let Some(open) = &self.side.docking {
+            self.side.tell(&open.master, act, content).await;
+        }
     }
 }

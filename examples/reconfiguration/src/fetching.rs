@@ -19,7 +19,7 @@ pub(crate) const SERVICE: &str = "fetch";
 /// Maximum wait for the decision of the operator.
 const TIMEOUT: Duration = Duration::from_secs(20);
 
-/// What a robot does with an item.
+/// The work of a robot with an item.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Way {
     /// It drives in front of the item, with a part of its body.

@@ -7,9 +7,9 @@ use std::time::Duration;
 use fipa::coalitions::LedCoalition;
 use fipa::locks::Owned;
 use fipa::platform::{Property, ServiceDescription};
-use fipa::protocol::{DialogueError, PartnerEvent, PartnerWatch, Reply, Task};
+use fipa::protocol::{DialogueError, Reply, Task};
 use fipa::topics::{Publisher, Topic};
-use fipa::{Agent, Domain, Message, Performative};
+use fipa::{Domain, Message, Performative};
 use tokio::sync::{Mutex, Notify};
 
 use crate::face::{Contact, Face};
@@ -17,7 +17,8 @@ use crate::hardware::{Hardware, HardwareError, IMAGE};
 use crate::owning::{coalition_options, own_all};
 use crate::part::{Failed, Mutant, Part, Stop};
 use crate::report::{Claim, Reporter};
-use crate::words::{self, DOCK, Docking, IMAGES};
+use crate::taking_part::{Event, Open, Side};
+use crate::words::{self, IMAGES};
 
 /// Images per second.
 const RATE: f64 = 20.0;
@@ -26,24 +27,14 @@ const RATE: f64 = 20.0;
 type Founded = Arc<Mutex<Option<LedCoalition>>>;
 
 struct Item<'a> {
-    part: &'a Part,
-    agent: Agent,
-    reporter: Reporter,
+    side: Side<'a>,
     hardware: Hardware,
     owned: [Arc<Owned>; 2],
-    partners: PartnerWatch,
-    docking: Option<Open>,
-    founded: Founded,
-}
-
-/// A docking that has begun.
-struct Open {
-    conversation: String,
-    master: String,
-    words: Docking,
+    /// Whether the interface of the docking is latched.
     latched: bool,
     /// Whether the interface stays open: the conversation may go on, the docking does not.
     is_over: bool,
+    founded: Founded,
 }
 
 /// Runs the program.
@@ -79,27 +70,20 @@ pub async fn run(part: &Part) -> Result<(), Failed> {
     reporter.claim(Claim::Ready);
 
     let mut item = Item {
-        part,
-        partners: agent.watch_partners(),
-        agent,
-        reporter,
+        side: Side::new(part, agent, reporter),
         hardware,
         owned,
-        docking: None,
+        latched: false,
+        is_over: false,
         founded,
     };
     let mut stop = Stop::default();
     loop {
         tokio::select! {
-            incoming = item.agent.receive() => {
-                let incoming = incoming?;
-                match incoming.violation() {
-                    Some(violation) => item.reporter.noticed(violation),
-                    None if incoming.message().protocol() == Some(DOCK) => item.handle(incoming.message()).await?,
-                    None => {}
-                }
-            }
-            event = item.partners.next() => item.partner(event).await?,
+            event = item.side.next() => match event? {
+                Event::Letter(message) => item.handle(&message).await?,
+                Event::Gone(agent) => item.open(&format!("{agent} is gone")).await?,
+            },
             () = ended.notified() => item.lock_ended().await?,
             () = stop.requested() => break,
         }
@@ -110,7 +94,7 @@ pub async fn run(part: &Part) -> Result<(), Failed> {
     Ok(())
 }
 
-/// Publishes images as long as somebody looks at them.
+/// Publishes images while there are subscribers.
 async fn publish(images: Publisher, mut camera: Hardware) -> Result<(), Failed> {
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
     loop {
@@ -149,18 +133,14 @@ async fn grow(
 
 impl Item<'_> {
     async fn handle(&mut self, message: &Message) -> Result<(), HardwareError> {
-        let conversation = message.conversation_id().unwrap_or_default();
-        let open = self
-            .docking
-            .as_ref()
-            .filter(|it| it.conversation == conversation);
-        match (message.performative(), open.is_some()) {
+        match (message.performative(), self.side.is_open(message)) {
             (Performative::Request, false) => self.begin(message).await,
             (Performative::Request, true) => self.latch(message).await?,
             (Performative::Confirm, true) => self.complete().await,
             (Performative::Cancel, _) => {
                 self.open("cancelled").await?;
-                self.answer(message, Performative::Inform, String::from("open"))
+                self.side
+                    .answer(message, Performative::Inform, "open")
                     .await;
             }
             _ => {}
@@ -168,147 +148,105 @@ impl Item<'_> {
         Ok(())
     }
 
-    /// Takes part in a docking, if the interface is free and its lock is held by the master.
+    /// Takes part in a docking whose master holds the lock of the interface.
     async fn begin(&mut self, message: &Message) {
-        let Some(words) = words::hear::<Docking>(message) else {
-            return self
-                .answer(message, Performative::Refuse, "expected a docking".into())
-                .await;
-        };
-        if let Err(reason) = self.admit(message, &words.face, "dock") {
-            return self.answer(message, Performative::Refuse, reason).await;
+        let owned = &self.owned;
+        let begun = self.side.begin(
+            message,
+            |words| lock_of(owned, &words.face),
+            |words| &words.client,
+        );
+        if begun.await {
+            (self.latched, self.is_over) = (false, false);
         }
-        let master = message
-            .sender()
-            .map(|id| id.name().to_owned())
-            .unwrap_or_default();
-        for agent in [&master, &words.client] {
-            self.partners.add(agent);
-        }
-        self.docking = Some(Open {
-            conversation: message.conversation_id().unwrap_or_default().to_owned(),
-            master,
-            words,
-            latched: false,
-            is_over: false,
-        });
-        self.answer(message, Performative::Agree, String::new())
-            .await;
     }
 
     /// Latches, and tells the client.
     async fn latch(&mut self, message: &Message) -> Result<(), HardwareError> {
-        let Some(Open { words, .. }) = &self.docking else {
+        let Some(Open { words, .. }) = &self.side.docking else {
             return Ok(());
         };
-        let (face, with, client) = (words.face.clone(), words.with.clone(), words.client.clone());
-        let contact = Contact { face, other: with };
-        let latched = match self.admit(message, &contact.face, "latch") {
-            Ok(()) if self.part.has(Mutant::ReportInvented) => Ok(()),
+        let client = words.client.clone();
+        let contact = Contact {
+            face: words.face.clone(),
+            other: words.with.clone(),
+        };
+        let Some(owned) = lock_of(&self.owned, &contact.face) else {
+            return Ok(());
+        };
+        let latched = match self.side.admit(message, owned, "latch") {
+            Ok(()) if self.side.part.has(Mutant::ReportInvented) => Ok(()),
             Ok(()) if self.hardware.latch(&contact.face.side).await? => Ok(()),
             Ok(()) => Err("nothing is in reach of the interface".to_owned()),
             Err(refused) => Err(refused),
         };
-        let (act, content) = match latched {
-            Ok(()) => (Performative::Inform, words::say(&contact)),
-            Err(reason) => (Performative::Failure, reason),
-        };
-        if act == Performative::Inform {
-            self.reporter.claim(Claim::Latched { contact });
-            if let Some(docking) = &mut self.docking {
-                docking.latched = true;
+        match latched {
+            Ok(()) => {
+                self.latched = true;
+                let content = words::say(&contact);
+                self.side.reporter.claim(Claim::Latched { contact });
+                self.side.tell(&client, Performative::Inform, content).await;
             }
+            Err(reason) => self.side.tell(&client, Performative::Failure, reason).await,
         }
-        let tell = self.agent.message(act).receiver(client).protocol(DOCK);
-        let conversation = message.conversation_id().unwrap_or_default();
-        self.send(tell.conversation_id(conversation).content(content))
-            .await;
         Ok(())
     }
 
     /// The client feels the contact: the first item founds the coalition.
     async fn complete(&mut self) {
-        let Some(Open { words, master, .. }) = self.docking.take() else {
+        let Some(Open { words, .. }) = self.side.end() else {
             return;
         };
-        for agent in [&master, &words.client] {
-            self.partners.remove(agent);
-        }
         if words.with.body == words.client {
-            let members = [words.client.as_str(), &self.part.name];
+            let members = [words.client.as_str(), &self.side.part.name];
             let founding =
-                self.agent
+                self.side
+                    .agent
                     .found_coalition(&words.coalition, members, coalition_options());
             match founding.await {
                 Ok(coalition) => *self.founded.lock().await = Some(coalition),
-                Err(error) => self.reporter.noticed(error),
+                Err(error) => self.side.reporter.noticed(error),
             }
         }
     }
 
     /// Opens the interface of a docking that does not go on.
     async fn open(&mut self, why: &str) -> Result<(), HardwareError> {
-        let Some(docking) = self.docking.as_mut().filter(|docking| !docking.is_over) else {
+        let docking = self.side.docking.as_ref();
+        let Some(face) = docking
+            .filter(|_| !self.is_over)
+            .map(|it| it.words.face.clone())
+        else {
             return Ok(());
         };
-        docking.is_over = true;
-        for agent in [&docking.master, &docking.words.client] {
-            self.partners.remove(agent);
-        }
-        let face = docking.words.face.clone();
-        if docking.latched {
+        self.is_over = true;
+        self.side.leave();
+        if self.latched {
             self.hardware.open(&face.side).await?;
         }
-        self.reporter.claim(Claim::Unlatched { face });
-        self.reporter
+        self.side.reporter.claim(Claim::Unlatched { face });
+        self.side
+            .reporter
             .noticed(format!("the docking has ended: {why}"));
-        Ok(())
-    }
-
-    async fn partner(&mut self, event: PartnerEvent) -> Result<(), HardwareError> {
-        match event {
-            PartnerEvent::Gone { agent } => self.open(&format!("{agent} is gone")).await?,
-            PartnerEvent::Unreachable { agent, .. } => {
-                self.reporter.noticed(format!("{agent} is unreachable"))
-            }
-            _ => {}
-        }
         Ok(())
     }
 
     /// The master may hold the interface no longer.
     async fn lock_ended(&mut self) -> Result<(), HardwareError> {
         let held = |open: &Open| {
-            let resource = open.words.face.to_string();
-            let owned = self.owned.iter().find(|owned| owned.resource() == resource);
+            let owned = lock_of(&self.owned, &open.words.face);
             owned.is_some_and(|owned| owned.status().holder.as_ref() == Some(&open.master))
         };
-        match self.docking.as_ref().is_some_and(|open| !held(open)) {
+        match self.side.docking.as_ref().is_some_and(|open| !held(open)) {
             true => self.open("the lock of the interface has ended").await,
             false => Ok(()),
         }
     }
+}
 
-    /// Checks the fence of a command for an interface.
-    fn admit(&self, message: &Message, face: &Face, action: &str) -> Result<(), String> {
-        if self.part.has(Mutant::FencesUnchecked) {
-            return Ok(());
-        }
-        let resource = face.to_string();
-        let owned = self.owned.iter().find(|owned| owned.resource() == resource);
-        let Some(owned) = owned else {
-            return Err(format!("this item has no interface {resource}"));
-        };
-        self.reporter
-            .admission(action, &resource, owned.check(message))
-    }
-
-    async fn answer(&self, message: &Message, act: Performative, content: String) {
-        self.send(self.agent.reply(message, act).content(content))
-            .await;
-    }
-
-    async fn send(&self, message: fipa::MessageBuilder) {
-        self.reporter.send(&self.agent, message).await;
-    }
+/// Returns the lock of an interface.
+fn lock_of<'o>(owned: &'o [Arc<Owned>], face: &Face) -> Option<&'o Owned> {
+    let resource = face.to_string();
+    let found = owned.iter().find(|owned| owned.resource() == resource);
+    found.map(AsRef::as_ref)
 }

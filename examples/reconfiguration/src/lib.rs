@@ -36,6 +36,7 @@ pub mod report;
 mod rogue;
 #[cfg(feature = "robots")]
 mod sherpa;
+mod taking_part;
 #[cfg(feature = "robots")]
 pub mod telling;
 mod words;

@@ -76,18 +76,6 @@ pub struct Part {
     pub mutant: Option<Mutant>,
 }
 
-impl Mutant {
-    /// All defects.
-    pub const ALL: [Self; 6] = [
-        Self::FencesUnchecked,
-        Self::EnforcementOff,
-        Self::LockSkipped,
-        Self::LeaderNotFenced,
-        Self::ReservationKept,
-        Self::ReportInvented,
-    ];
-}
-
 impl Part {
     /// Returns the configuration.
     ///

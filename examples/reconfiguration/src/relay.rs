@@ -36,7 +36,7 @@ impl Relay {
     /// Starts a relay to this address.
     pub(crate) async fn start(to: SocketAddr, link: Link) -> std::io::Result<Self> {
         // Another address of this machine than that of the gateway behind it, which announces its own port: at this
-        // address, nobody listens there.
+        // address, no gateway listens there.
         let listener = TcpListener::bind((Ipv4Addr::new(127, 0, 0, 2), 0)).await?;
         let address = listener.local_addr()?;
         let (passes, seen) = watch::channel(true);

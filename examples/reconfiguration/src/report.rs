@@ -126,7 +126,7 @@ pub enum Claim {
         members: Vec<String>,
         leader: Option<String>,
     },
-    /// Somebody notices a fault.
+    /// An agent notices a fault.
     Noticed { what: String },
     /// An image of a camera, which the leader was asked for.
     Image {

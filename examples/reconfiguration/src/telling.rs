@@ -44,7 +44,7 @@ pub fn told(report: &Report) -> Option<String> {
             members,
             leader,
         } if !members.is_empty() => {
-            let leader = leader.as_deref().unwrap_or("nobody yet");
+            let leader = leader.as_deref().unwrap_or("no member yet");
             format!("{name} is {}, led by {leader}", members.join(", "))
         }
         Claim::Coalition { name, .. } => format!("{name} is dissolved"),
