@@ -329,6 +329,25 @@ async fn a_program_that_does_not_read_keeps_the_newest_and_other_messages_arrive
     assert!(images.rate().unwrap() > 0.0);
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_dropped_subscription_ends_at_the_publisher() {
+    let (here, there) = support::two(&config(&[])).await;
+    let agent = here.register("camera").await.unwrap();
+    let camera = agent.publisher("image").unwrap();
+    let rover = there.register("rover").await.unwrap();
+    for keep in [Keep::All, Keep::latest(1)] {
+        drop(subscribed(&rover, keep, "image").await.unwrap());
+        while camera.publish("x").await.subscribers() > 0 {
+            tokio::task::yield_now().await;
+        }
+    }
+    // No notification takes its place in the queue of the rover.
+    let hello = agent.message(Performative::Inform).receiver("rover");
+    assert!(agent.send(hello).await.unwrap().all_succeeded());
+    let received = rover.receive_within(TIMEOUT).await.unwrap().unwrap();
+    assert_eq!(received.message().content(), None);
+}
+
 /// Forwards connections to a gateway, each byte after this delay. Returns its address.
 async fn distance(to: String, delay: Duration) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();

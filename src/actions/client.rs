@@ -377,8 +377,7 @@ impl fmt::Debug for GoalHandle<'_> {
     }
 }
 
-/// The progress of a goal; see [`GoalHandle::progress`]. Dropping it does not cancel the subscription;
-/// further notifications go to [`Agent::receive`].
+/// The progress of a goal; see [`GoalHandle::progress`]. Dropping it cancels the subscription, not the goal.
 #[derive(Debug)]
 #[must_use = "next() returns the progress"]
 pub struct ProgressUpdates {
@@ -414,8 +413,7 @@ impl ProgressUpdates {
     }
 }
 
-/// The status of all goals of a robot; see [`Robot::watch_status`]. Dropping it does not cancel the
-/// subscription; further notifications go to [`Agent::receive`].
+/// The status of all goals of a robot; see [`Robot::watch_status`]. Dropping it cancels the subscription.
 #[derive(Debug)]
 #[must_use = "next() returns the status"]
 pub struct StatusUpdates {

@@ -21,8 +21,7 @@ const GRACE: Duration = Duration::from_secs(5);
 const PAUSE: Duration = Duration::from_millis(100);
 const MAX_PAUSE: Duration = Duration::from_secs(5);
 
-/// A subscription to a directory facilitator. Dropping it does not cancel it; further notifications go
-/// to [`Agent::receive`](crate::Agent::receive).
+/// A subscription to a directory facilitator. Dropping it cancels it.
 ///
 /// If the directory facilitator ends, for example with its gateway, the subscription waits for its
 /// return and then goes on: the descriptions that have changed meanwhile are notified.

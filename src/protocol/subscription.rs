@@ -158,7 +158,7 @@ impl Deref for Notification {
     }
 }
 
-/// A subscription. Dropping it does not cancel it; further notifications go to [`Agent::receive`].
+/// A subscription. Dropping it cancels it; [`cancel`](Self::cancel) also waits for the confirmation.
 ///
 /// It does not borrow the agent. It is also a [`Stream`], which ends after an error that ends the
 /// subscription.
@@ -170,14 +170,13 @@ impl Deref for Notification {
 pub struct Subscription {
     id: String,
     reachability: Reachability,
-    dialogue: Arc<Mutex<Dialogue>>,
+    led: Arc<Mutex<Led>>,
     /// The notifications that a task reads, and that task. `None` if the partner does not know topics.
     reader: Option<Reader>,
     /// The wait of the stream for the next notification.
     waiting: Option<Waiting>,
     /// Whether an error has ended the subscription.
     is_over: bool,
-    receivers: Vec<AgentId>,
     early: Option<Message>,
     /// The numbers and the times of the last notifications.
     last: VecDeque<(u64, SystemTime)>,
@@ -318,10 +317,101 @@ impl QueueState {
     }
 }
 
+/// The conversation of a subscription. Dropping it cancels the subscription.
+struct Led {
+    /// `None` once it was cancelled.
+    dialogue: Option<Dialogue>,
+    receivers: Vec<AgentId>,
+    timeout: Duration,
+}
+
+impl Led {
+    /// Waits for the answer to the first message.
+    async fn first(&mut self, due: Option<std::time::Instant>) -> Result<Message, DialogueError> {
+        match &mut self.dialogue {
+            Some(dialogue) => Ok(dialogue.receive(due).await?.message),
+            None => std::future::pending().await,
+        }
+    }
+
+    /// Waits for the next message of the other side. A `failure` is an error.
+    async fn read(&mut self) -> Result<Message, DialogueError> {
+        let Some(dialogue) = &mut self.dialogue else {
+            return std::future::pending().await;
+        };
+        let message = dialogue.receive_or_silence().await?.message;
+        match message.performative() {
+            Performative::Failure => Err(DialogueError::Failed(Box::new(message))),
+            _ => Ok(message),
+        }
+    }
+
+    async fn cancel(&mut self, timeout: Duration) -> Result<(), DialogueError> {
+        let Some(dialogue) = &mut self.dialogue else {
+            return Ok(());
+        };
+        let result = dialogue
+            .cancel(self.receivers.clone(), after(timeout))
+            .await;
+        if result.as_ref().map_or_else(is_end, |()| true) {
+            self.dialogue = None;
+        }
+        result
+    }
+
+    /// Goes on with another conversation. The receivers of the reachability stay those of the subscription.
+    fn replace(&mut self, mut other: Self) {
+        if let (Some(ended), Some(dialogue)) = (&mut self.dialogue, &mut other.dialogue) {
+            dialogue.take_reachability(ended);
+        }
+        *self = other;
+    }
+}
+
+impl Drop for Led {
+    fn drop(&mut self) {
+        let Some(dialogue) = self.dialogue.take() else {
+            return;
+        };
+        let inner = &dialogue.agent().endpoint.domain.inner;
+        if dialogue.is_over() || dialogue.all_gone() || !inner.owner.is_this() {
+            return;
+        }
+        let runtime = inner.service.runtime.clone();
+        let receivers = std::mem::take(&mut self.receivers);
+        runtime.spawn(end(dialogue, receivers, self.timeout));
+    }
+}
+
+/// Cancels a subscription of which the program wants no more notifications, and discards those that still arrive: in
+/// the agent's queue they would take the place of other letters.
+async fn end(mut dialogue: Dialogue, receivers: Vec<AgentId>, timeout: Duration) {
+    loop {
+        match dialogue.cancel(receivers.clone(), after(timeout)).await {
+            Ok(()) => return,
+            Err(error) if is_end(&error) => return log_end(&dialogue, &error),
+            // The publisher did not get the cancel or did not answer it. Its next message is the earliest sign that
+            // another attempt can succeed.
+            Err(error) => log_end(&dialogue, &error),
+        }
+        if let Err(error) = dialogue.receive(None).await
+            && is_end(&error)
+        {
+            return log_end(&dialogue, &error);
+        }
+    }
+}
+
+fn log_end(dialogue: &Dialogue, error: &DialogueError) {
+    let (agent, conversation) = (&*dialogue.agent().endpoint.name, dialogue.id());
+    tracing::debug!(%error, %agent, %conversation, "cannot cancel a subscription");
+}
+
 /// A conversation that a partner has accepted.
 struct Begun {
-    dialogue: Dialogue,
-    receivers: Vec<AgentId>,
+    id: String,
+    reachability: Reachability,
+    led: Led,
     /// The answer of the partner to the wish; `None` if it does not know topics.
     keep: Option<Keep>,
     early: Option<Message>,
@@ -335,9 +425,15 @@ async fn begin(
     let due = after(timeout);
     let (subscribe, receivers) = single(core, subscribe)?;
     let opened = Dialogue::open(core, "fipa-subscribe", subscribe, due);
-    let (mut dialogue, sent) = opened.await?;
+    let (dialogue, sent) = opened.await?;
     only_delivered(&sent)?;
-    let first = dialogue.receive(due).await?.message;
+    let (id, reachability) = (dialogue.id().to_owned(), dialogue.reachability());
+    let mut led = Led {
+        dialogue: Some(dialogue),
+        receivers,
+        timeout,
+    };
+    let first = led.first(due).await?;
     let mut keep = None;
     let early = match first.performative() {
         Performative::Agree => {
@@ -349,8 +445,9 @@ async fn begin(
         _ => Some(first),
     };
     Ok(Begun {
-        dialogue,
-        receivers,
+        id,
+        reachability,
+        led,
         keep,
         early,
     })
@@ -364,22 +461,23 @@ impl Subscription {
     ) -> Result<Self, DialogueError> {
         let begun = begin(core, subscribe.clone(), timeout).await?;
         let Begun {
-            dialogue,
-            receivers,
+            id,
+            reachability,
+            led,
             keep,
             early,
         } = begun;
-        let (id, reachability) = (dialogue.id().to_owned(), dialogue.reachability());
-        let dialogue = Arc::new(Mutex::new(dialogue));
+        let receivers = led.receivers.clone();
+        let led = Arc::new(Mutex::new(led));
         let reader = keep.map(|keep| {
             let queue = Arc::new(Queue::default());
             queue.state.lock().keep = keep.bound(false);
             let reading = Reading {
                 core: Arc::clone(core),
                 subscribe,
-                receivers: receivers.clone(),
+                receivers,
                 timeout,
-                dialogue: Arc::clone(&dialogue),
+                led: Arc::clone(&led),
                 queue: Arc::clone(&queue),
             };
             let runtime = &core.endpoint.domain.inner.service.runtime;
@@ -389,11 +487,10 @@ impl Subscription {
         Ok(Self {
             id,
             reachability,
-            dialogue,
+            led,
             reader,
             waiting: None,
             is_over: false,
-            receivers,
             early,
             last: VecDeque::new(),
         })
@@ -459,8 +556,8 @@ impl Subscription {
                 Box::pin(async move { queue.next().await })
             }
             None => {
-                let dialogue = Arc::clone(&self.dialogue);
-                Box::pin(async move { read(&dialogue).await.map(Received::from) })
+                let led = Arc::clone(&self.led);
+                Box::pin(async move { led.lock().await.read().await.map(Received::from) })
             }
         }
     }
@@ -505,22 +602,12 @@ impl Subscription {
     ///
     /// # Errors
     /// If the other side continues the subscription ([`DialogueError::Failed`]), is gone, or does not
-    /// answer within `timeout`.
+    /// answer within `timeout`. Notifications that arrive after the timeout are discarded.
     pub async fn cancel(mut self, timeout: Duration) -> Result<(), DialogueError> {
         self.waiting = None;
         // Its task reads no longer.
         self.reader = None;
-        let mut dialogue = self.dialogue.lock().await;
-        dialogue.cancel(self.receivers, after(timeout)).await
-    }
-}
-
-/// Waits for the next message of the other side. A `failure` is an error.
-async fn read(dialogue: &Mutex<Dialogue>) -> Result<Message, DialogueError> {
-    let message = dialogue.lock().await.receive_or_silence().await?.message;
-    match message.performative() {
-        Performative::Failure => Err(DialogueError::Failed(Box::new(message))),
-        _ => Ok(message),
+        self.led.lock().await.cancel(timeout).await
     }
 }
 
@@ -530,7 +617,7 @@ struct Reading {
     subscribe: MessageBuilder,
     receivers: Vec<AgentId>,
     timeout: Duration,
-    dialogue: Arc<Mutex<Dialogue>>,
+    led: Arc<Mutex<Led>>,
     queue: Arc<Queue>,
 }
 
@@ -538,7 +625,8 @@ impl Reading {
     async fn run(self) {
         loop {
             self.queue.has_room().await;
-            match read(&self.dialogue).await {
+            let read = self.led.lock().await.read().await;
+            match read {
                 Ok(message) => self.queue.notification(message),
                 Err(error) => {
                     let (is_gone, goes_on) = (can_return(&error), goes_on(&error));
@@ -576,12 +664,7 @@ impl Reading {
             pause = (pause * 2).min(AGAIN_LAST);
             match begin(&self.core, self.subscribe.clone(), self.timeout).await {
                 Ok(begun) => {
-                    let mut dialogue = begun.dialogue;
-                    let mut ended = self.dialogue.lock().await;
-                    // The receivers of the reachability stay those of the subscription.
-                    dialogue.take_reachability(&mut ended);
-                    *ended = dialogue;
-                    drop(ended);
+                    self.led.lock().await.replace(begun.led);
                     let mut state = self.queue.state.lock();
                     state.restarted = true;
                     state.keep = begun.keep.and_then(|keep| keep.bound(false));
@@ -637,6 +720,18 @@ fn goes_on(error: &DialogueError) -> bool {
     )
 }
 
+/// Whether a subscription has ended by the other side, or for this agent.
+fn is_end(error: &DialogueError) -> bool {
+    matches!(
+        error,
+        DialogueError::Gone { .. }
+            | DialogueError::Failed(_)
+            | DialogueError::NotUnderstood(_)
+            | DialogueError::Send(_)
+            | DialogueError::Receive(_)
+    )
+}
+
 /// Whether the publisher has ended, and may return.
 fn can_return(error: &DialogueError) -> bool {
     matches!(error, DialogueError::Gone { .. } | DialogueError::Failed(_))
@@ -646,7 +741,6 @@ impl fmt::Debug for Subscription {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Subscription")
             .field("id", &self.id)
-            .field("receivers", &self.receivers)
             .finish_non_exhaustive()
     }
 }

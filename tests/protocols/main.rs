@@ -291,6 +291,37 @@ async fn a_subscription_goes_on_until_it_is_cancelled() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_dropped_subscription_is_cancelled_and_its_notifications_are_discarded() {
+    let (rover, arm) = pair(&["monitor.check=enforce"]).await;
+    let initiator = async {
+        let subscribe = to(&rover, Performative::Subscribe, &arm, "pose");
+        let mut poses = rover.subscribe(subscribe, TIMEOUT).await.unwrap();
+        assert_eq!(text(&poses.next().await.unwrap()), "0");
+    };
+    let participant = async {
+        let first = next_message(&arm).await.unwrap();
+        let handler = async |task: &mut Task| {
+            task.agree("").await?;
+            for number in 0..10 {
+                task.inform(number.to_string()).await?;
+            }
+            task.cancelled().await?;
+            task.confirm_cancel().await
+        };
+        respond(&arm, &first, handler).await.unwrap();
+        let hello = to(&arm, Performative::Inform, &rover, "hello");
+        assert!(
+            arm.send(hello.build().unwrap())
+                .await
+                .unwrap()
+                .all_succeeded()
+        );
+    };
+    tokio::join!(initiator, participant);
+    assert_eq!(text(next_message(&rover).await.unwrap().message()), "hello");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_request_is_cancelled() {
     let (rover, arm) = pair(&[]).await;
     let initiator = async {
