@@ -109,6 +109,8 @@ pub mod blocking;
 pub mod coalitions;
 pub mod config;
 mod domain;
+#[cfg(any(feature = "protocols", feature = "secure"))]
+mod durable;
 pub mod error;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]

@@ -21,7 +21,9 @@ pub(super) fn turn_of(
     let mut turn = Duration::ZERO;
     for member in order {
         if **member == *own {
-            return Some(turn);
+            // The others may not know that it led, and then count from the first member.
+            let led = last_leader == Some(own);
+            return Some(if led { turn + TURN } else { turn });
         }
         if is_registered(member) {
             turn += TURN;
@@ -44,9 +46,9 @@ mod tests {
             })
         };
         assert_eq!(turns(None), [0, 1, 2, 2]);
-        assert_eq!(turns(Some("a")), [2, 0, 1, 1]);
-        assert_eq!(turns(Some("c")), [1, 2, 3, 0]);
-        assert_eq!(turns(Some("d")), [0, 1, 2, 2]);
+        assert_eq!(turns(Some("a")), [3, 0, 1, 1]);
+        assert_eq!(turns(Some("c")), [1, 2, 4, 0]);
+        assert_eq!(turns(Some("d")), [0, 1, 2, 3]);
         assert_eq!(turns(Some("left")), [0, 1, 2, 2]);
         assert_eq!(turn_of("e", &members, None, |_| true), None);
         assert_eq!(turn_of("e", &[], Some("a"), |_| true), None);

@@ -6,12 +6,14 @@
 use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::fs::{self, File, TryLockError};
-use std::io::{self, Write as _};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use fipa_locking::{Millis, OwnerState, OwnerStateError};
 use fipa_transport::log_limit;
+
+use crate::durable;
 
 /// Environment variable with the state directory.
 const VARIABLE: &str = "FIPA_STATE_DIR";
@@ -90,7 +92,7 @@ impl StateFile {
             source,
         };
         let parent = path.parent().unwrap_or(&directory);
-        fs::create_dir_all(parent).map_err(failed)?;
+        durable::create_directories(parent, 0o700).map_err(failed)?;
         let lock = File::create(with_suffix(&path, ".lock")).map_err(failed)?;
         let started = Instant::now();
         while let Err(error) = lock.try_lock() {
@@ -164,17 +166,9 @@ fn default_directory(variable: impl Fn(&str) -> Option<OsString>) -> Option<Path
     Some(PathBuf::from(set("HOME")?).join(".local/state/fipa"))
 }
 
-/// Replaces the file, so that a crash leaves the old or the new one.
+/// Replaces the file. After a loss of power it has the old or the new state.
 fn write(path: &Path, state: &OwnerState) -> io::Result<()> {
-    let new = with_suffix(path, ".new");
-    let mut file = File::create(&new)?;
-    file.write_all(state.to_string().as_bytes())?;
-    file.sync_all()?;
-    fs::rename(&new, path)?;
-    match path.parent() {
-        Some(parent) => File::open(parent)?.sync_all(),
-        None => Ok(()),
-    }
+    durable::replace(path, state.to_string().as_bytes(), 0o600)
 }
 
 fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
@@ -253,6 +247,33 @@ mod tests {
             .path()
             .join("locks/default/crane/bay%2f%2e%2e%2f1");
         assert!(path.is_file());
+    }
+
+    #[test]
+    fn no_cut_of_power_lowers_the_epoch() {
+        let first = || OwnerState::first().next_life(100);
+        let life = |root: &Path| StateFile::begin(Some(root), NAMES, 100, first(), None).unwrap();
+        let epoch = |root: &Path| life(root).state().epoch();
+        // The values are the highest epochs that were used.
+        let mut cuts = durable::cuts::of(
+            |_| {},
+            epoch,
+            |root, before| assert!(epoch(root) > before.copied().unwrap_or_default()),
+        );
+        cuts += durable::cuts::of(
+            |root| drop(life(root)),
+            |root| {
+                let mut life = life(root);
+                life.raise(1_000).unwrap();
+                life.end(true);
+                life.state().epoch()
+            },
+            |root, before| {
+                let after = epoch(root);
+                assert!(after > before.copied().unwrap_or(1), "{after}");
+            },
+        );
+        assert!(cuts > 2_000, "{cuts}");
     }
 
     #[test]

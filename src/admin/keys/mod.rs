@@ -9,7 +9,8 @@
 //! | `revoked/<fingerprint>.pem` | a certificate that must never be trusted again |
 //!
 //! All are PEM (RFC 7468). Only their owner and root may write to the directories and to the
-//! certificates of peers. A running gateway applies changes within seconds, without a restart.
+//! certificates of peers. A running gateway applies changes within seconds, without a restart. If the power fails while
+//! the next key replaces the own one, `next.pem` counts as the own certificate until the switch is repeated.
 //!
 //! Not in this module: the use of keys on connections (`fipa_transport_net::secure`).
 
@@ -17,9 +18,9 @@ mod error;
 #[cfg(test)]
 mod tests;
 
-use std::fs::{self, DirBuilder, Metadata, OpenOptions};
-use std::io::{self, Write as _};
-use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _};
+use std::fs::{self, Metadata};
+use std::io;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
@@ -29,11 +30,12 @@ pub use fipa_transport_net::secure::{
     Certificate, CertificateError, Certified, CredentialsError, Fingerprint,
 };
 use fipa_transport_net::secure::{Credentials, alternative_names};
-use rcgen::{CertificateParams, DnType, KeyPair, SanType};
+use rcgen::{CertificateParams, DnType, KeyPair, PublicKeyData as _, SanType};
 use rustls_pki_types::pem::PemObject as _;
 use rustls_pki_types::{CertificateDer, PrivateKeyDer};
 
 pub use self::error::KeysError;
+use crate::durable;
 
 /// Maximum size of a file, in bytes.
 const MAX_FILE: u64 = 1 << 20;
@@ -217,15 +219,34 @@ impl Keys {
     /// # Errors
     /// If there are no next ones, or the directory cannot be written.
     pub fn switch(&self) -> Result<Certificate, KeysError> {
-        let (key, certificate) = (self.dir.join("next.key"), self.next_file());
-        if !key.exists() || !certificate.exists() {
-            return Err(KeysError::NoNext(self.dir.clone()));
+        let key = self.dir.join("next.key");
+        if !self.is_half_switched() {
+            if !key.exists() || !self.next_file().exists() {
+                return Err(KeysError::NoNext(self.dir.clone()));
+            }
+            rename(&key, &self.own_key())?;
         }
-        // A gateway that reads between the two renames finds a key that does not belong to the
-        // certificate, and reads again.
-        rename(&key, &self.dir.join("own.key"))?;
-        rename(&certificate, &self.own_file())?;
+        rename(&self.next_file(), &self.own_file())?;
         self.own()
+    }
+
+    /// Whether the key was switched and the certificate was not: the power failed in between, or another process is
+    /// switching.
+    fn is_half_switched(&self) -> bool {
+        // Mostly there is no next certificate, and the key need not be read.
+        let Ok(Some(next)) = self.next() else {
+            return false;
+        };
+        let Ok(key) = key_pair(&self.own_key()) else {
+            return false;
+        };
+        let key = key.subject_public_key_info();
+        let mut parts = next.der().windows(key.len());
+        parts.any(|part| part == key)
+    }
+
+    fn own_key(&self) -> PathBuf {
+        self.dir.join("own.key")
     }
 
     fn make(
@@ -246,8 +267,8 @@ impl Keys {
             self.dir.join(format!("{what}.key")),
             self.dir.join(format!("{what}.pem")),
         );
-        if let Some(there) = [&key_file, &file].into_iter().find(|file| file.exists()) {
-            return Err(KeysError::Exists(there.clone()));
+        if file.exists() {
+            return Err(KeysError::Exists(file));
         }
         let mut params = CertificateParams::default();
         params.distinguished_name.push(DnType::CommonName, mts);
@@ -257,10 +278,17 @@ impl Keys {
         }
         params.not_before = (now - SKEW).into();
         params.not_after = until.into();
-        let key = KeyPair::generate().map_err(failed)?;
+        // A key without a certificate is what a loss of power leaves.
+        let former = key_file.exists();
+        let key = match former {
+            true => key_pair(&key_file)?,
+            false => KeyPair::generate().map_err(failed)?,
+        };
         let signed = params.self_signed(&key).map_err(failed)?;
         let certificate = Certificate::from_der(signed.der().to_vec())?;
-        write_new(&key_file, key.serialize_pem().as_bytes(), 0o600)?;
+        if !former {
+            write_new(&key_file, key.serialize_pem().as_bytes(), 0o600)?;
+        }
         write_new(&file, signed.pem().as_bytes(), 0o644)?;
         Ok(certificate)
     }
@@ -270,7 +298,11 @@ impl Keys {
     /// # Errors
     /// If there is none, or it cannot be read.
     pub fn own(&self) -> Result<Certificate, KeysError> {
-        let own = certificate_in(&self.own_file())?;
+        let file = match self.is_half_switched() {
+            true => self.next_file(),
+            false => self.own_file(),
+        };
+        let own = certificate_in(&file)?;
         own.ok_or_else(|| KeysError::Missing(self.dir.clone()))
     }
 
@@ -389,7 +421,7 @@ impl Keys {
         let meant = self.trusted_as(which)?;
         for certificate in &meant {
             let path = self.file("trusted", certificate.fingerprint());
-            fs::remove_file(&path).map_err(|source| KeysError::Io { path, source })?;
+            durable::remove(&path).map_err(|source| KeysError::Io { path, source })?;
         }
         Ok(meant)
     }
@@ -448,7 +480,7 @@ impl Keys {
     fn credentials(&self) -> Result<Credentials, KeysError> {
         let own = self.own()?;
         let user = rustix::process::geteuid().as_raw();
-        let file = self.dir.join("own.key");
+        let file = self.own_key();
         let meta = fs::metadata(&file).map_err(|source| io_error(&file, source))?;
         if meta.mode() & 0o077 != 0 || meta.uid() != user {
             return Err(KeysError::Readable(file));
@@ -562,24 +594,23 @@ fn contents(path: &Path, what: &dyn std::fmt::Display) -> KeysError {
 }
 
 fn make_private(dir: &Path) -> Result<(), KeysError> {
-    let mut private = DirBuilder::new();
-    let created = private.recursive(true).mode(0o700).create(dir);
-    created.map_err(|source| io_error(dir, source))
+    durable::create_directories(dir, 0o700).map_err(|source| io_error(dir, source))
 }
 
 fn write_new(file: &Path, bytes: &[u8], mode: u32) -> Result<(), KeysError> {
-    let mut options = OpenOptions::new();
-    let opened = options.write(true).create_new(true).mode(mode).open(file);
-    let written =
-        opened.and_then(|mut opened| opened.write_all(bytes).and_then(|()| opened.sync_all()));
-    written.map_err(|source| match source.kind() {
+    durable::create(file, bytes, mode).map_err(|source| match source.kind() {
         io::ErrorKind::AlreadyExists => KeysError::Exists(file.to_owned()),
         _ => io_error(file, source),
     })
 }
 
 fn rename(from: &Path, to: &Path) -> Result<(), KeysError> {
-    fs::rename(from, to).map_err(|source| io_error(from, source))
+    durable::rename(from, to).map_err(|source| io_error(from, source))
+}
+
+fn key_pair(file: &Path) -> Result<KeyPair, KeysError> {
+    let pem = read(file)?;
+    KeyPair::from_pem(&String::from_utf8_lossy(&pem)).map_err(|error| contents(file, &error))
 }
 
 fn read(file: &Path) -> Result<Vec<u8>, KeysError> {

@@ -100,6 +100,84 @@ fn a_renewed_key_is_used_after_the_switch() {
     assert_eq!(keys.credentials().unwrap().own, next);
 }
 
+/// Each call can be repeated after a cut, and what it has reported stays.
+#[test]
+fn no_cut_of_power_leaves_unusable_keys_or_forgets_a_reported_change() {
+    let peer = {
+        let (_dir, keys) = keys();
+        keys.init("crex", &[], VALID).unwrap();
+        fs::read(keys.own_file()).unwrap()
+    };
+    let at = |root: &Path| Keys::at(root.join("fipa/keys"));
+    let own = |root: &Path| at(root).credentials().unwrap().own;
+    let init = |root: &Path| at(root).init("rover", &[], VALID).unwrap();
+    let begun = |root: &Path| drop(init(root));
+    let renewed = |root: &Path| drop((init(root), at(root).renew(VALID).unwrap()));
+    let trusting = |root: &Path| drop((init(root), at(root).trust(&peer).unwrap()));
+    let mut cuts = durable::cuts::of(
+        |_| {},
+        init,
+        |root, made| match made {
+            Some(made) => assert_eq!(own(root), *made),
+            None if at(root).own_file().exists() => drop(own(root)),
+            None => assert_eq!(init(root), own(root)),
+        },
+    );
+    cuts += durable::cuts::of(
+        begun,
+        |root| (own(root), at(root).renew(VALID).unwrap()),
+        |root, made| {
+            let next = match at(root).next().unwrap() {
+                Some(next) => next,
+                None => at(root).renew(VALID).unwrap(),
+            };
+            if let Some((before, made)) = made {
+                assert_eq!((&own(root), &next), (before, made));
+            }
+            assert_eq!(at(root).switch().unwrap(), next);
+            assert_eq!(own(root), next);
+        },
+    );
+    cuts += durable::cuts::of(
+        renewed,
+        |root| at(root).switch().unwrap(),
+        |root, made| {
+            let found = own(root);
+            assert!(made.is_none_or(|made| *made == found));
+            let switched = at(root).switch();
+            assert!(matches!(switched, Ok(_) | Err(KeysError::NoNext(_))));
+            assert!(switched.is_ok() || own(root) == found);
+        },
+    );
+    cuts += durable::cuts::of(
+        begun,
+        |root| at(root).trust(&peer).unwrap(),
+        |root, trusted| {
+            let found = at(root).credentials().unwrap().trusted;
+            assert!(trusted.is_none_or(|trusted| *trusted == found));
+            assert_eq!(at(root).trust(&peer).unwrap().len(), 1);
+        },
+    );
+    cuts += durable::cuts::of(
+        trusting,
+        |root| at(root).revoke("crex").unwrap(),
+        |root, revoked| {
+            let credentials = at(root).credentials().unwrap();
+            assert_ne!(credentials.trusted.len(), credentials.revoked.len());
+            assert!(revoked.is_none() || credentials.trusted.is_empty());
+        },
+    );
+    cuts += durable::cuts::of(
+        trusting,
+        |root| at(root).distrust("crex").unwrap(),
+        |root, ended| {
+            let trusted = at(root).credentials().unwrap().trusted;
+            assert!(ended.is_none() || trusted.is_empty());
+        },
+    );
+    assert!(cuts > 8_000, "{cuts}");
+}
+
 #[test]
 fn a_validity_of_zero_or_beyond_the_year_9999_is_refused() {
     let (_dir, keys) = keys();
