@@ -48,7 +48,7 @@ pub(crate) fn of<T>(
 ) -> u64 {
     let scene = tempfile::tempdir().unwrap();
     before(scene.path());
-    let start = Disk::read(scene.path());
+    let start = Disk::of(scene.path());
     RECORDED.set(Some(Vec::new()));
     let value = change(scene.path());
     let steps = RECORDED.take().unwrap_or_default();
@@ -100,19 +100,19 @@ enum Node {
 
 impl Disk {
     /// A file system with the synced contents of a directory.
-    fn read(root: &Path) -> Self {
+    fn of(root: &Path) -> Self {
         let mut disk = Self::default();
-        disk.read_below(root, root);
+        disk.add_below(root, root);
         disk.changes.iter_mut().for_each(|it| it.unsynced.clear());
         disk
     }
 
-    fn read_below(&mut self, root: &Path, directory: &Path) {
+    fn add_below(&mut self, root: &Path, directory: &Path) {
         for entry in fs::read_dir(directory).unwrap() {
             let path = entry.unwrap().path();
             if path.is_dir() {
                 self.apply(root, &Step::Directory(path.clone()));
-                self.read_below(root, &path);
+                self.add_below(root, &path);
             } else {
                 let bytes = fs::read(&path).unwrap();
                 self.apply(root, &Step::Write(path.clone(), bytes));

@@ -446,7 +446,7 @@ async fn a_fence_never_comes_back_on_another_host() {
         let [rover, arm] = [agent(&here, "rover").await, agent(&here, "arm").await];
         let gate = agent(&here, "gate").await;
         let device = gate.device("crane", "bay").unwrap();
-        let lease = Duration::from_secs(1);
+        let lease = Duration::from_secs(5);
         let crane = agent(&there, "crane").await;
         let bay = crane.own("bay", kept(&first, lease)).await.unwrap();
         let lock = rover.lock("bay").await.unwrap();
@@ -492,7 +492,7 @@ async fn an_owner_grants_above_the_fence_of_a_device() {
         let crane = agent(&here, "crane").await;
         let rover = agent(&there, "rover").await;
         let gate = agent(&there, "gate").await;
-        let lease = Duration::from_secs(1);
+        let lease = Duration::from_secs(5);
         let bay = crane.own("bay", kept(&files, lease)).await.unwrap();
         let device = gate.device("crane", "bay").unwrap();
         let ahead = "200000000000.7.00000000000000aa@crane#bay";
