@@ -9,6 +9,7 @@ use std::time::Duration;
 use clap::Args;
 use fipa::admin::contact;
 use fipa::admin::routes::{self, AskError, RouteReport};
+use fipa::admin::stopped::StoppedAgent;
 use fipa::config::{ConfigError, Reloaded};
 use fipa::error::{DomainDirError, ErrorChain, ListenError, OpenError, RegisterError};
 use fipa::threads::ThreadError;
@@ -110,17 +111,9 @@ fn has_terminal() -> bool {
     std::fs::File::open("/dev/tty").is_ok()
 }
 
-/// Returns the process of a local agent if it is stopped. The name of its service ends with the process.
-pub(crate) fn stopped_process(entry: &Entry) -> Option<u32> {
-    let service = entry.mts.name.as_deref();
-    let service = service.filter(|_| entry.reach == Reach::Local && entry.role == Role::Agent)?;
-    let (_, process) = service.rsplit_once('-')?;
-    let process: u32 = process.parse().ok()?;
-    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
-    // The name of the program is in parentheses and may contain any character.
-    let (_, after_name) = stat.rsplit_once(')')?;
-    let state = after_name.split_whitespace().next()?;
-    matches!(state, "T" | "t").then_some(process)
+/// Returns the agent of this name if it is one of this host and its process is stopped.
+pub(crate) fn stopped(agent: &Agent, name: &str) -> Option<StoppedAgent> {
+    StoppedAgent::of(&*agent.domain().directory().known(name)?)
 }
 
 /// Joins the domain of the configuration. From then on, `fipa reload` and SIGHUP make the process read it again.

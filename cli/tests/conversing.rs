@@ -317,7 +317,9 @@ fn topics_lists_topics_with_their_rates_and_subscribers() {
     }
     viewer.send_signal("-STOP");
     let stopped = host.run(&["topics", "camera"]).done();
-    assert!(stopped.contains("is stopped; `kill -CONT"), "{stopped}");
+    for part in ["is stopped, by SIGSTOP", "`kill -CONT"] {
+        assert!(stopped.contains(part), "{stopped}");
+    }
     let stopped: Value =
         serde_json::from_str(&host.run(&["topics", "camera", "--json"]).done()).unwrap();
     assert!(stopped[0]["topics"][0]["first_subscribers"][0]["stopped"].is_u64());
@@ -420,6 +422,25 @@ fn words_of_other_tools_lead_to_the_command() {
         let error = host.run(&[word]).failed(2);
         assert!(error.contains(command), "{word}: {error}");
     }
+}
+
+#[test]
+fn ping_names_a_stopped_process_first() {
+    let host = Host::new();
+    let arm = host.echo("arm");
+    arm.send_signal("-STOP");
+    let pid = arm.pid();
+    let ping = ["ping", "arm", "--count", "1", "--set", "mts.deadline=300ms"];
+    let (_, error) = host.run(&ping).failed_text();
+    let stopped = format!(
+        "the process {pid} of arm is stopped, by SIGSTOP, Ctrl-Z or a debugger; continue it: `kill -CONT {pid}`"
+    );
+    assert!(
+        error.starts_with(&format!("warning: {stopped}\nerror: 1 of 1 pings")),
+        "{error}"
+    );
+    assert!(error.contains(&format!(" help: {stopped}\n")), "{error}");
+    arm.send_signal("-CONT");
 }
 
 #[test]

@@ -89,6 +89,7 @@ fn a_machine_without_problems_is_fine_and_is_not_changed() {
         "leftovers of ended processes",
         "permissions in /dev/shm",
         "memory of waiting letters",
+        "stopped processes",
     ] {
         assert_eq!(check(&report, name).0, "fine", "{report}");
     }
@@ -128,6 +129,23 @@ fn files_of_a_killed_process_are_reported_until_the_next_process_removes_them() 
     host.run(&["agents"]).done();
     let after = host.run(&["doctor", "--json"]).done_json();
     assert_eq!(check(&after, "leftovers of ended processes").0, "fine");
+}
+
+#[test]
+fn a_stopped_process_is_a_warning_until_it_continues() {
+    let host = Host::new();
+    let arm = host.echo("arm");
+    arm.send_signal("-STOP");
+    let pid = arm.pid();
+    let report = host.run(&["doctor", "--json"]).done_json();
+    let found = format!("the process {pid} of arm is stopped, by SIGSTOP, Ctrl-Z or a debugger");
+    assert_eq!(check(&report, "stopped processes"), ("warning", &*found));
+    let checks = report["checks"].as_array().unwrap();
+    let advice = format!("continue it: `kill -CONT {pid}`");
+    assert!(checks.iter().any(|it| it["advice"] == *advice), "{report}");
+    arm.send_signal("-CONT");
+    let report = host.run(&["doctor", "--json"]).done_json();
+    assert_eq!(check(&report, "stopped processes").0, "fine");
 }
 
 #[test]

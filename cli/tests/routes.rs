@@ -53,6 +53,38 @@ fn routes_of_processes_and_of_the_gateway_are_shown() {
 }
 
 #[test]
+fn a_receiver_whose_process_is_stopped_is_named() {
+    let host = Host::new();
+    let arm = host.echo("arm");
+    let _camera = host.echo("camera");
+    assert_eq!(
+        host.run(&["routes", "--json"]).done_json()["stopped"],
+        json!([])
+    );
+    arm.send_signal("-STOP");
+    let pid = arm.pid();
+    let routes = host.run(&["routes"]).done();
+    let lines = |name: &str| {
+        let mut lines = routes.lines().filter(|line| line.starts_with(name));
+        lines.next().unwrap().to_owned()
+    };
+    let status = format!("first, but process {pid} is stopped");
+    assert!(lines("arm ").ends_with(&status), "{routes}");
+    assert!(lines("camera ").ends_with("first, ready"), "{routes}");
+    let stopped = format!(
+        "the process {pid} of arm is stopped, by SIGSTOP, Ctrl-Z or a debugger; continue it: `kill -CONT {pid}`"
+    );
+    assert_eq!(routes.matches(&stopped).count(), 1, "{routes}");
+    let in_json = host.run(&["routes", "arm", "--json"]).done_json();
+    let process: u32 = pid.parse().unwrap();
+    assert_eq!(
+        in_json["stopped"],
+        json!([{ "receiver": "arm", "process": process }])
+    );
+    arm.send_signal("-CONT");
+}
+
+#[test]
 fn an_invalid_pattern_is_rejected() {
     let host = Host::new();
     let output = host.run(&["routes", "arm_("]).failed(2);

@@ -540,7 +540,13 @@ fn a_receiver_whose_process_is_stopped_is_named() {
     let (_, error) = host.run(&send).failed_text();
     let stopped = format!("the process {} of arm is stopped", arm.pid());
     assert!(error.contains(&stopped), "{error}");
+    assert!(error.contains("the receiver may get it twice"), "{error}");
     let table = host.run(&["agents"]).done();
-    assert!(table.contains("  stopped"), "{table}");
+    let pid = arm.pid();
+    assert!(table.contains(&format!("  stopped (pid {pid})")), "{table}");
+    assert!(
+        table.lines().all(|line| line.chars().count() <= 80),
+        "{table}"
+    );
     arm.send_signal("-CONT");
 }

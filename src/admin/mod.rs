@@ -7,4 +7,5 @@ pub mod keys;
 pub mod open_files;
 pub mod reload;
 pub mod routes;
+pub mod stopped;
 pub mod watch;

@@ -6,7 +6,7 @@ use fipa_sds::{Cancellation, HostConfig, HostDirectory, HostError, Role};
 
 use crate::domain::files::{DomainDir, RETRIES};
 use crate::error::OpenError;
-use crate::{Config, Domain};
+use crate::{Config, Domain, Entry};
 
 impl Domain {
     /// Returns the names of the agents of a domain that its processes on this host list, sorted, without
@@ -16,11 +16,7 @@ impl Domain {
     /// # Errors
     /// If the directory of the domain cannot be used.
     pub fn names(config: &Config) -> Result<Vec<String>, OpenError> {
-        let dir = DomainDir::of(&config.domain);
-        if !dir.exists()? {
-            return Ok(Vec::new());
-        }
-        let entries = HostDirectory::peek(&dir.part("directory"))?;
+        let entries = Self::peek(config)?;
         let mut names: Vec<String> = entries.iter().map(|entry| entry.name.to_string()).collect();
         names.dedup();
         Ok(names)
@@ -32,13 +28,18 @@ impl Domain {
     /// # Errors
     /// If the directory of the domain cannot be used.
     pub fn gateway_name(config: &Config) -> Result<Option<String>, OpenError> {
-        let dir = DomainDir::of(&config.domain);
-        if !dir.exists()? {
-            return Ok(None);
-        }
-        let entries = HostDirectory::peek(&dir.part("directory"))?;
+        let entries = Self::peek(config)?;
         let mut gateways = entries.iter().filter(|entry| entry.role == Role::Gateway);
         Ok(gateways.next().map(|gateway| gateway.name.to_string()))
+    }
+
+    /// Reads the directory of a domain without joining the domain. The result is sorted by name.
+    pub(crate) fn peek(config: &Config) -> Result<Vec<Arc<Entry>>, OpenError> {
+        let dir = DomainDir::of(&config.domain);
+        if !dir.exists()? {
+            return Ok(Vec::new());
+        }
+        Ok(HostDirectory::peek(&dir.part("directory"))?)
     }
 }
 

@@ -15,7 +15,7 @@ use crate::complete;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output::{self, Reader};
-use crate::report::Failure;
+use crate::report::{self, Failure};
 
 /// Ontology of the messages, so that an agent can ignore them.
 const ONTOLOGY: &str = "fipa-ping";
@@ -107,21 +107,29 @@ async fn ping(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
         () = reader.gone() => Ok(()),
         () = options::after(arguments.time) => Ok(()),
     };
+    let receiver = arguments.name.name();
+    let stopped = membership::stopped(&agent, receiver);
     Stop::ending();
     drop(agent);
     domain.close().await;
     ended?;
-    let receiver = arguments.name.name();
     match arguments.json {
         true => output::json_line(&tally.json())?,
         false => output::text(&tally.text(receiver))?,
     }
     let failed = tally.pings - tally.delivered();
     Failure::all((failed > 0).then(|| {
+        let help = match stopped {
+            Some(stopped) => format!("{stopped}; {}", stopped.remedy()),
+            None => {
+                "`fipa routes` shows the route to the agent, and `fipa agents` whether it is known"
+                    .to_owned()
+            }
+        };
         Failure::failed(
             format!("{failed} of {} pings were not delivered", tally.pings),
             format!("{receiver:?}"),
-            "`fipa routes` shows the route to the agent, and `fipa agents` whether it is known",
+            help,
         )
     }))
 }
@@ -130,6 +138,10 @@ async fn ping_all(agent: &Agent, arguments: &Arguments, tally: &mut Tally) -> Re
     let mut starts = tokio::time::interval(arguments.interval);
     let to = arguments.addresses.of(agent, &arguments.name).await?;
     starts.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    // The first ping fails only after the deadline.
+    if let Some(stopped) = membership::stopped(agent, to.name()) {
+        report::warn(&format!("{stopped}; {}", stopped.remedy()));
+    }
     let content = vec![b'.'; arguments.size];
     while arguments.count.is_none_or(|count| tally.pings < count) {
         starts.tick().await;

@@ -5,9 +5,10 @@ use std::time::Duration;
 use clap::Args;
 use comfy_table::Table;
 use fipa::admin::routes::{Connected, Route, RouteReport, RouteState, Standing};
+use fipa::admin::stopped::StoppedAgent;
 use fipa::{Config, Kind, Location, Matcher, Query, Signature};
 use fipa_acl::{escape, escape_name};
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::complete;
 use crate::membership;
@@ -42,7 +43,8 @@ Columns:
   CERTIFICATE  the first digits of its fingerprint; `fipa keys list` shows all
 
 JSON:
-  { \"domain\": text, \"process\": report, \"gateway\": report, or null if no gateway is running }
+  { \"domain\": text, \"process\": report, \"gateway\": report, or null if no gateway is running,
+    \"stopped\": stopped }
   report = { \"mts\": name, \"incarnation\", \"locations\": [ text ],
     \"routes\": [ { \"receiver\", \"incarnation\", \"gateway\": incarnation or null,
                   \"exception\": the matching pattern of [routes], or null,
@@ -56,7 +58,8 @@ JSON:
     \"neighbors\": [ { \"name\", \"incarnation\", \"locations\", \"connections\", \"seconds\",
                       \"security\": { \"encrypted\": true or false,
                                     \"certificate\": fingerprint or null } } ],
-    \"configuration\": { key: value as TOML } of a gateway }")]
+    \"configuration\": { key: value as TOML } of a gateway }
+  stopped = [ { \"receiver\", \"process\" } ], the receivers whose process is stopped")]
 pub(crate) struct Arguments {
     /// Show only routes to agents with this name or with a name that matches this pattern
     #[arg(value_parser = parse_receivers, add = complete::agents())]
@@ -85,17 +88,23 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let config = global.config()?;
     let pattern = arguments.pattern.as_ref();
     let query = pattern.map_or_else(Query::all, |it| Query::by_name(it.matcher.clone()));
-    let (process, gateway) = membership::run(async {
+    let (process, gateway, stopped) = membership::run(async {
         let domain = membership::join(&config).await?;
         domain.directory().refresh();
         let process = domain.routes(&query);
+        let known = |route: &Route| StoppedAgent::of(&*domain.directory().known(&route.receiver)?);
+        let stopped: Vec<StoppedAgent> = process.routes.iter().filter_map(known).collect();
         let gateway = membership::gateway_report(&domain, pattern.map(|it| it.text.as_str())).await;
         domain.close().await;
-        Ok((process, gateway?))
+        Ok((process, gateway?, stopped))
     })?;
     if arguments.json {
+        let in_json = stopped
+            .iter()
+            .map(|it| json!({ "receiver": it.name, "process": it.process }));
+        let in_json: Vec<Value> = in_json.collect();
         return output::json(
-            &json!({ "domain": config.domain, "process": process, "gateway": gateway }),
+            &json!({ "domain": config.domain, "process": process, "gateway": gateway, "stopped": in_json }),
         );
     }
     if process.routes.is_empty() {
@@ -103,14 +112,20 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let domain = &config.domain;
         return output::text(&format!("no agent{named} is known in domain {domain}\n"));
     }
-    output::text(&described(&process, gateway.as_ref(), &config))
+    output::text(&described(&process, gateway.as_ref(), &stopped, &config))
 }
 
-fn described(process: &RouteReport, gateway: Option<&RouteReport>, config: &Config) -> String {
+fn described(
+    process: &RouteReport,
+    gateway: Option<&RouteReport>,
+    stopped: &[StoppedAgent],
+    config: &Config,
+) -> String {
     let mut text = String::new();
     let mut table = output::table(["TO", "FROM", "ROUTE", "STATUS"]);
     for route in &process.routes {
-        rows_of(&mut table, route, "this host", |location| {
+        let stopped = stopped.iter().find(|it| *it.name == *route.receiver);
+        rows_of(&mut table, route, "this host", stopped, |location| {
             unused_by_process(route, location, config)
         });
         let remote = gateway.filter(|_| route.gateway.is_some());
@@ -118,12 +133,15 @@ fn described(process: &RouteReport, gateway: Option<&RouteReport>, config: &Conf
         if let Some((gateway, onward)) =
             remote.and_then(|it| Some((it, it.routes.iter().find(same)?)))
         {
-            rows_of(&mut table, onward, "gateway", |location| {
+            rows_of(&mut table, onward, "gateway", None, |location| {
                 unused_by_gateway(onward, location, gateway)
             });
         }
     }
     text.push_str(&format!("{}\n", table.trim_fmt()));
+    for agent in stopped {
+        text.push_str(&format!("\n{agent}; {}\n", agent.remedy()));
+    }
     match gateway {
         Some(gateway) => text.push_str(&gateway_described(gateway)),
         None => text.push_str("\nno gateway is running, so agents on other hosts are unreachable; start one with `fipa up`\n"),
@@ -223,7 +241,13 @@ fn fingerprint(certificate: &str) -> &str {
 }
 
 /// Adds the rows of a route. `unused` returns the reason why no letter takes a location.
-fn rows_of(table: &mut Table, route: &Route, from: &str, unused: impl Fn(&Location) -> String) {
+fn rows_of(
+    table: &mut Table,
+    route: &Route,
+    from: &str,
+    stopped: Option<&StoppedAgent>,
+    unused: impl Fn(&Location) -> String,
+) {
     let receiver = match &route.exception {
         Some(pattern) => format!("{} (by routes.{pattern:?})", escape_name(&route.receiver)),
         None => escape_name(&route.receiver).into_owned(),
@@ -244,6 +268,9 @@ fn rows_of(table: &mut Table, route: &Route, from: &str, unused: impl Fn(&Locati
         let status = match &way.standing {
             Standing::NotInOrder => format!("not used: {}", unused(&way.location)),
             Standing::Unsupported => standing(&way.standing),
+            Standing::Ready if let Some(StoppedAgent { process, .. }) = stopped => {
+                format!("{place}, but process {process} is stopped")
+            }
             used => format!("{place}, {}", standing(used)),
         };
         table.add_row([to, from, &way.location.to_string(), &status]);

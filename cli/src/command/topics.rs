@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
+use fipa::admin::stopped::StoppedAgent;
 use fipa::platform::{AgentDescription, PlatformError, ServiceDescription};
 use fipa::protocol::DialogueError;
 use fipa::topics::{SubscriberStatus, TopicStatus, TopicsError};
@@ -160,7 +161,7 @@ async fn topics_of_all(
 fn print(agent: &Agent, listed: &Listed, arguments: &Arguments) -> Result<(), Failure> {
     let stopped = |subscriber: &SubscriberStatus| {
         let entry = agent.domain().directory().lookup(&subscriber.name)?;
-        membership::stopped_process(&entry)
+        StoppedAgent::of(&entry)
     };
     if arguments.json {
         let agents = listed.iter().map(|(agent, topics)| {
@@ -222,7 +223,10 @@ fn print(agent: &Agent, listed: &Listed, arguments: &Arguments) -> Result<(), Fa
 }
 
 /// The subscribers of a topic, in a table.
-fn subscribers(topic: &TopicStatus, stopped: impl Fn(&SubscriberStatus) -> Option<u32>) -> String {
+fn subscribers(
+    topic: &TopicStatus,
+    stopped: impl Fn(&SubscriberStatus) -> Option<StoppedAgent>,
+) -> String {
     let mut text = format!("subscribers to {}:\n", escape(&topic.name));
     let mut table = output::table([
         "SUBSCRIBER",
@@ -236,8 +240,8 @@ fn subscribers(topic: &TopicStatus, stopped: impl Fn(&SubscriberStatus) -> Optio
     let mut reasons = String::new();
     for subscriber in &topic.first_subscribers {
         let name = escape_name(&subscriber.name);
-        let process = stopped(subscriber);
-        let state = process.map_or("", |_| "stopped");
+        let stopped = stopped(subscriber);
+        let state = stopped.as_ref().map_or("", |_| "stopped");
         table.add_row([
             name.clone().into_owned(),
             state.to_owned(),
@@ -247,11 +251,8 @@ fn subscribers(topic: &TopicStatus, stopped: impl Fn(&SubscriberStatus) -> Optio
             subscriber.failed.to_string(),
             subscriber.waiting.to_string(),
         ]);
-        if let Some(process) = process {
-            let _ = writeln!(
-                reasons,
-                "{name}: its process {process} is stopped; `kill -CONT {process}` continues it"
-            );
+        if let Some(stopped) = stopped {
+            let _ = writeln!(reasons, "{stopped}; {}", stopped.remedy());
         }
         if let Some(failure) = &subscriber.last_failure {
             let _ = writeln!(reasons, "{name}: last failure: {}", escape(failure));
@@ -276,10 +277,13 @@ fn rate(topic: &TopicStatus) -> String {
     }
 }
 
-fn status(topic: &TopicStatus, stopped: impl Fn(&SubscriberStatus) -> Option<u32>) -> Value {
+fn status(
+    topic: &TopicStatus,
+    stopped: impl Fn(&SubscriberStatus) -> Option<StoppedAgent>,
+) -> Value {
     let subscriber = |it: &SubscriberStatus| {
         json!({
-            "name": it.name, "stopped": stopped(it), "keep": it.keep, "delivered": it.delivered,
+            "name": it.name, "stopped": stopped(it).map(|it| it.process), "keep": it.keep, "delivered": it.delivered,
             "replaced": it.replaced, "failed": it.failed, "waiting": it.waiting, "last_failure": it.last_failure,
         })
     };

@@ -15,6 +15,7 @@ mod network;
 mod other_users;
 #[cfg(feature = "net")]
 mod peers;
+mod processes;
 mod queues;
 #[cfg(feature = "net")]
 mod security;
@@ -63,6 +64,7 @@ pub fn examine(config: &Config) -> Vec<Check> {
     let mut checks = Vec::new();
     domain_dir::examine(config, &mut checks);
     other_users::examine(config, &mut checks);
+    processes::examine(config, &mut checks);
     #[cfg(feature = "shm")]
     if config.mts.transports.contains(&crate::Kind::Shm) {
         shm::examine(config, &mut checks);

@@ -10,6 +10,7 @@ use std::time::Duration;
 use clap::Args;
 use fipa::admin::keys::Keys;
 use fipa::admin::routes::{ASKER_TYPE, Connected, LostHost};
+use fipa::admin::stopped::StoppedAgent;
 use fipa::{
     Config, DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role,
     Signature, Source, Time,
@@ -19,7 +20,7 @@ use serde_json::{Value, json};
 
 use super::routes::security;
 use crate::complete;
-use crate::membership::{self, stopped_process};
+use crate::membership;
 use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
@@ -47,7 +48,9 @@ Columns:
              legacy peer its address
   AGE        time since its registration
   STATE      ready         on this host
-             stopped       on this host, and its process is stopped, for example by Ctrl-Z
+             stopped (pid N)
+                           on this host, and its process N is stopped, for example
+                           by Ctrl-Z; `kill -CONT N` continues it
              encrypted, not encrypted
                            the connection with its host; `fipa routes` has its
                            certificate
@@ -76,7 +79,7 @@ JSON:
                   \"locations\": [ text ], \"unsupported_transports\": [ transport ], if no
                   location has a supported one, \"mts\": { \"name\", \"incarnation\" },
                   \"incarnation\", \"registered\": time, \"source\": as above,
-                  \"stopped\": the process, if it is stopped,
+                  \"stopped\": the identifier of its process, if it is stopped,
                   \"addresses\": [ text ], those of the gateway of this host for platforms } ],
     \"lost\": [ { \"name\", \"seconds\" since it was last seen,
                 \"certificate\": fingerprint or null } ] }
@@ -413,7 +416,8 @@ impl Row {
             "registered": registered.ok().and_then(Time::to_rfc3339),
             "source": entry.source,
         });
-        if let Some(process) = stopped_process(entry) {
+        let stopped = StoppedAgent::of(entry).map(|it| it.process);
+        if let Some(process) = stopped {
             json["stopped"] = process.into();
         }
         let link = reported.links.get(&entry.mts.incarnation);
@@ -466,7 +470,7 @@ impl Row {
                     _ if members.is_vacant() => "vacant".to_owned(),
                     count => format!("{count} members"),
                 },
-                _ => state(entry, link, has_report).to_owned(),
+                _ => state(entry, stopped, link, has_report),
             },
         ];
         let long_cells = [
@@ -493,18 +497,26 @@ fn host(entry: &Entry, at: &[Location]) -> String {
 }
 
 /// The state of an agent as table text.
-fn state(entry: &Entry, link: Option<&Connected>, has_report: bool) -> &'static str {
-    match entry.reach {
+fn state(
+    entry: &Entry,
+    stopped: Option<u32>,
+    link: Option<&Connected>,
+    has_report: bool,
+) -> String {
+    let state = match entry.reach {
         _ if entry.is_unsupported() => "unsupported",
-        Reach::Local if stopped_process(entry).is_some() => "stopped",
-        Reach::Local => "ready",
+        Reach::Local => match stopped {
+            Some(process) => return format!("stopped (pid {process})"),
+            None => "ready",
+        },
         Reach::Remote { .. } => match link {
             Some(link) => security(link.security.encrypted),
             // A legacy peer keeps no connection.
             None if is_legacy(entry) || !has_report => "",
             None => "no connection",
         },
-    }
+    };
+    state.to_owned()
 }
 
 /// The fingerprints of the trusted certificates; `None` without keys.

@@ -1,7 +1,5 @@
 //! Remedies for messages that were not delivered.
 
-use std::sync::Arc;
-
 use fipa::error::SendError;
 use fipa::monitor::ViolationKind;
 use fipa::{Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, is_pattern};
@@ -9,7 +7,7 @@ use fipa::{Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, is_
 use fipa_acl::escape_name;
 use fipa_monitor::one_edit_apart;
 
-use crate::membership::stopped_process;
+use crate::membership;
 use crate::output;
 use crate::report::Failure;
 
@@ -131,15 +129,11 @@ fn no_such_agent(names: &[&str], agent: &Agent, config: &Config) -> String {
 
 /// The remedy if the process of one of these agents is stopped.
 fn stopped(names: &[&str], agent: &Agent) -> Option<String> {
-    let directory = agent.domain().directory();
-    let entries = names.iter().filter_map(|name| directory.known(name));
-    let (entry, process) = entries
-        .filter_map(|entry| Some((Arc::clone(&entry), stopped_process(&entry)?)))
-        .next()?;
+    let mut names = names.iter();
+    let stopped = names.find_map(|name| membership::stopped(agent, name))?;
     Some(format!(
-        "the process {process} of {} is stopped, by SIGSTOP, Ctrl-Z or a debugger; continue it: `kill -CONT {process}`. \
-         It may then take the message, so ask it before sending the message again",
-        escape_name(&entry.name)
+        "{stopped}; {}. It may then take this message: if you send the message again, the receiver may get it twice",
+        stopped.remedy()
     ))
 }
 
@@ -188,7 +182,7 @@ fn advice(reason: FailureReason, config: &Config) -> String {
         }
         FailureReason::TimedOut => "increase --deadline; see the attempts above".to_owned(),
         FailureReason::Unconfirmed => {
-            "the message may have been delivered: ask the receiver before sending it again"
+            "the message may have been delivered: if you send it again, the receiver may get it twice"
                 .to_owned()
         }
         FailureReason::Loop => {
