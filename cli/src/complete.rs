@@ -174,7 +174,7 @@ fn words() -> impl Iterator<Item = OsString> {
 }
 
 /// The sources of the configuration that this command line names.
-fn sources(words: impl Iterator<Item = OsString>) -> Sources {
+pub(crate) fn sources(words: impl Iterator<Item = OsString>) -> Sources {
     let mut sources = Sources::from_environment();
     let mut words = words.map(|word| word.to_string_lossy().into_owned());
     while let Some(word) = words.next() {

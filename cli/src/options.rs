@@ -17,7 +17,7 @@ use fipa::threads;
 use fipa_acl::escape_name;
 use tokio::runtime;
 
-use crate::command::Command;
+use crate::command::{Command, topics};
 use crate::complete;
 use crate::report::{self, Failure};
 
@@ -31,7 +31,7 @@ use crate::report::{self, Failure};
 #[command(
     name = "fipa",
     version,
-    after_help = EXIT_CODES,
+    after_help = AFTER_HELP,
     subcommand_required = true,
     arg_required_else_help = true
 )]
@@ -76,14 +76,27 @@ fn with_meant_command(mut error: clap::Error) -> clap::Error {
         "pub" => &["publish"],
         "sub" => &["subscribe"],
         "list" | "ls" | "ps" | "node" | "nodes" | "info" | "status" => &["agents"],
-        "service" | "services" | "call" => &["request", "df"],
+        "hz" | "bw" => &["subscribe", "topics"],
+        "service" | "services" | "call" => &["request", "actions", "df"],
         "action" => &["actions"],
         "param" | "params" | "set" => &["config"],
         "record" | "bag" | "log" | "monitor" => &["watch"],
-        "start" | "run" | "daemon" | "gateway" | "serve" => &["up"],
+        "start" | "run" | "launch" | "daemon" | "gateway" | "serve" => &["up"],
         _ => return error,
     };
+    let tip = match word {
+        "hz" | "bw" => Some("fipa subscribe NAME TOPIC --rate measures the rate of a topic"),
+        "bag" | "record" => Some("fipa watch --record FILE records letters"),
+        "service" | "services" | "call" => Some(
+            "fipa request NAME CONTENT calls an agent, and fipa actions lists the actions of robots",
+        ),
+        _ => None,
+    };
     let meant = meant.iter().map(|command| (*command).to_owned()).collect();
+    if let Some(tip) = tip {
+        let tips = ContextValue::StyledStrs(vec![tip.into()]);
+        error.insert(ContextKind::Suggested, tips);
+    }
     error.insert(
         ContextKind::SuggestedSubcommand,
         ContextValue::Strings(meant),
@@ -91,20 +104,28 @@ fn with_meant_command(mut error: clap::Error) -> clap::Error {
     error
 }
 
-/// Splits the path of a topic of ROS, where `fipa subscribe` has two arguments.
+/// Splits the path of a topic of ROS, where `fipa subscribe` has two arguments. Names the agent that publishes a topic
+/// if only the topic is given.
 fn with_topic(mut error: clap::Error, arguments: &[String]) -> clap::Error {
     if error.kind() == ErrorKind::MissingRequiredArgument
         && let Some(at) = arguments.iter().position(|it| it == "subscribe")
         && let Some(name) = arguments.get(at + 1)
-        && let Some((publisher, topic)) = of_publisher(name)
+        && let Some(tip) = missing_topic(name)
     {
-        let tip = format!(
-            "the agent and the topic are two arguments: fipa subscribe {publisher} {topic}"
-        );
         let tips = ContextValue::StyledStrs(vec![tip.into()]);
         error.insert(ContextKind::Suggested, tips);
     }
     error
+}
+
+/// The tip for `fipa subscribe` with this argument alone.
+fn missing_topic(name: &str) -> Option<String> {
+    match of_publisher(name) {
+        Some((publisher, topic)) => Some(format!(
+            "the agent and the topic are two arguments: fipa subscribe {publisher} {topic}"
+        )),
+        None => topics::tip_for_one_argument(name, &complete::sources(std::env::args_os())),
+    }
 }
 
 /// Reads the name of an agent as the path of a topic in ROS: the agent and its topic.
@@ -123,7 +144,11 @@ fn with_global_options(command: Clap) -> Clap {
     command.mut_subcommands(|command| with_global_options(Global::augment_args(command)))
 }
 
-const EXIT_CODES: &str = "\
+const AFTER_HELP: &str = "\
+For users of ROS 2:
+  node list -> fipa agents       topic echo -> fipa subscribe
+  topic list -> fipa topics      topic hz -> fipa subscribe --rate
+
 Exit codes:
   0  success
   1  failure; standard error has the reason

@@ -246,10 +246,15 @@ fn a_signal_cancels_a_request() {
 fn subscribe_prints_notifications_until_its_end() {
     let host = Host::new();
     let _agents = agents(&host);
-    let printed = host
-        .run(&["subscribe", "battery", "charge", "--count", "2"])
-        .done();
-    assert_eq!(printed, "80.5\n80.5\n");
+    let two = host.run(&["subscribe", "battery", "charge", "--count", "2"]);
+    assert_eq!((two.code, &two.stdout[..]), (Some(0), &b"80.5\n80.5\n"[..]));
+    for part in ["2 values: ", " Hz, ", " ms on average (min ", " 4 B, "] {
+        assert!(two.stderr.contains(part), "{}", two.stderr);
+    }
+    assert!(two.stderr.ends_with(" missed\n"), "{}", two.stderr);
+    let once = ["subscribe", "battery", "charge", "--once"];
+    assert_eq!(host.run(&once).done(), "80.5\n");
+    host.run(&[&once[..], &["--count", "2"]].concat()).failed(2);
     let full = ["subscribe", "battery", "charge", "--count", "1", "--full"];
     let printed = host.run(&full).done();
     assert!(printed.contains(":content \"80.5\""), "{printed}");
@@ -259,6 +264,23 @@ fn subscribe_prints_notifications_until_its_end() {
     let line: Value = serde_json::from_str(&subscription.line()).unwrap();
     assert_eq!(line["notification"]["content"], "80.5");
     assert_eq!(subscription.signal("-INT"), (Some(0), String::new()));
+
+    let rate = ["subscribe", "battery", "charge", "--rate"];
+    let mut rates = host.start(&rate);
+    for line in [rates.ready.clone(), rates.line()] {
+        assert!(line.contains(" Hz, ") && line.contains(" 4 B, "), "{line}");
+    }
+    let (code, summary) = rates.signal("-INT");
+    assert_eq!(code, Some(0));
+    assert!(summary.contains(" values: "), "{summary}");
+    let mut rates = host.start(&[&rate[..], &["--json"]].concat());
+    let line: Value = serde_json::from_str(&rates.line()).unwrap();
+    assert!(line["values"].as_u64() > Some(1), "{line}");
+    assert!(
+        line["rate"].is_number() && line["avg"].is_number(),
+        "{line}"
+    );
+    assert_eq!(rates.signal("-INT"), (Some(0), String::new()));
 
     let unknown = host.run(&["subscribe", "battery", "voltage"]).failed(1);
     assert!(unknown.contains("topics: charge"), "{unknown}");
@@ -288,6 +310,8 @@ fn publish_gives_each_subscriber_the_newest_value() {
     let received = subscribe.output().unwrap();
     assert!(received.status.success(), "{received:?}");
     assert!(received.stdout == [&image[..], &image].concat());
+    let summary = String::from_utf8(received.stderr).unwrap();
+    assert!(summary.starts_with("2 values: "), "{summary}");
     let (code, _) = publishing.signal("-INT");
     assert_eq!(code, Some(0));
 }
@@ -344,6 +368,39 @@ fn topics_lists_topics_with_their_rates_and_subscribers() {
     let unknown = host.run(&["topics", "unknown"]).failed(1);
     assert!(unknown.contains("no such agent"), "{unknown}");
     drop(gateway);
+}
+
+#[test]
+fn a_topic_in_place_of_an_agent_leads_to_its_publisher() {
+    let host = Host::new();
+    let alone = host.run(&["subscribe", "odom"]).failed(2);
+    assert!(!alone.contains("tip:"), "{alone}");
+    assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+    let base = host.start(&["publish", "base", "odom", "1.5", "--rate", "100"]);
+    for word in ["odom", "/odom"] {
+        let error = host.run(&["topics", word]).failed(1);
+        let expected = format!(
+            "error: there is no agent \"{word}\"\nwhere: domain {}\n \
+             help: \"odom\" is a topic of base: fipa topics base\n",
+            host.domain
+        );
+        assert_eq!(error, expected);
+        let error = host.run(&["subscribe", word]).failed(2);
+        let tip = "tip: \"odom\" is a topic of base: fipa subscribe base odom";
+        assert!(error.contains(tip), "{error}");
+    }
+    let error = host.run(&["subscribe", "base"]).failed(2);
+    let tip = "tip: fipa topics base lists the topics of base";
+    assert!(error.contains(tip), "{error}");
+    let _second = host.start(&["publish", "base_2", "odom", "1.5"]);
+    let error = host.run(&["topics", "odom"]).failed(1);
+    let several = "\"odom\" is a topic of base, base_2: fipa topics base\n";
+    assert!(error.contains(several), "{error}");
+    base.send_signal("-STOP");
+    let error = host.run(&["topics", "base"]).failed(1);
+    let stopped = format!("the process {} of base is stopped", base.pid());
+    assert!(error.contains(&stopped), "{error}");
+    base.send_signal("-CONT");
 }
 
 #[test]
@@ -418,10 +475,42 @@ fn words_of_other_tools_lead_to_the_command() {
         ("list", "'agents'"),
         ("ps", "'agents'"),
         ("node", "'agents'"),
+        ("hz", "tip: fipa subscribe NAME TOPIC --rate"),
+        ("hz", "'subscribe', 'topics'"),
+        ("bag", "tip: fipa watch --record FILE"),
+        ("service", "tip: fipa request NAME CONTENT"),
+        ("service", "'request', 'actions', 'df'"),
+        ("run", "'up'"),
+        ("launch", "'up'"),
+        ("param", "'config'"),
     ] {
         let error = host.run(&[word]).failed(2);
         assert!(error.contains(command), "{word}: {error}");
     }
+}
+
+#[test]
+fn the_help_has_the_words_of_ros() {
+    let host = Host::new();
+    let help = |arguments: &[&str]| {
+        let help = host.run(arguments).done();
+        help.split_whitespace().collect::<Vec<_>>().join(" ")
+    };
+    let all = help(&["--help"]);
+    for words in [
+        "node list -> fipa agents",
+        "topic hz -> fipa subscribe --rate",
+    ] {
+        assert!(all.contains(words), "{all}");
+    }
+    let topics = help(&["topics", "--help"]);
+    let rate = "RATE is the publisher's own rate over its last 32 values";
+    assert!(topics.contains(rate), "{topics}");
+    let subscribe = help(&["subscribe", "--help"]);
+    let summary = "Print the values of a topic Leads the protocol fipa-subscribe (FIPA00035)";
+    assert!(subscribe.starts_with(summary), "{subscribe}");
+    let stream = "A topic is a stream if its publisher declares a rate or loans the contents";
+    assert!(subscribe.contains(stream), "{subscribe}");
 }
 
 #[test]

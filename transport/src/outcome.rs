@@ -96,13 +96,18 @@ impl fmt::Display for Outcome {
                 attempts
             }
         };
-        for same in attempts.chunk_by(|one, other| one == other) {
-            let Some(attempt) = same.first() else {
+        // Each location once, in the order of the first attempts, with its last error.
+        for (index, attempt) in attempts.iter().enumerate() {
+            let is_same =
+                |other: &&Attempt| (other.via, &other.location) == (attempt.via, &attempt.location);
+            if attempts.iter().take(index).any(|it| is_same(&it)) {
                 continue;
-            };
-            write!(f, "; tried {attempt}")?;
-            if same.len() > 1 {
-                write!(f, " ({} times)", same.len())?;
+            }
+            let same = attempts.iter().filter(is_same);
+            let (count, last) = same.fold((0, attempt), |(count, _), it| (count + 1, it));
+            write!(f, "; tried {last}")?;
+            if count > 1 {
+                write!(f, " ({count} attempts)")?;
             }
         }
         Ok(())
@@ -174,5 +179,38 @@ impl fmt::Display for FailureReason {
             Self::Unsupported => "unsupported transport",
             Self::NoRoom => "no memory for the letter",
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::TransportErrorKind;
+
+    #[test]
+    fn the_text_has_each_location_once_with_its_last_error() {
+        let attempt = |location: &str, detail: &str| {
+            let location: Location = location.parse().unwrap();
+            Attempt {
+                via: location.kind(),
+                location,
+                error: TransportError::new(TransportErrorKind::Unreachable, detail),
+            }
+        };
+        let (near, far) = ("tcp://10.0.0.3:7788", "tcp://10.0.0.4:7788");
+        let outcome = Outcome::Failed {
+            reason: FailureReason::Unreachable,
+            attempts: vec![
+                attempt(near, "no answer"),
+                attempt(far, "refused"),
+                attempt(near, "no answer"),
+                attempt(near, "reset"),
+            ],
+        };
+        assert_eq!(
+            outcome.to_string(),
+            "failed: unreachable; tried tcp://10.0.0.3:7788: unreachable: reset (3 attempts); \
+             tried tcp://10.0.0.4:7788: unreachable: refused"
+        );
     }
 }

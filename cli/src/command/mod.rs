@@ -31,7 +31,7 @@ mod request;
 mod routes;
 mod send;
 mod subscribe;
-mod topics;
+pub(crate) mod topics;
 mod up;
 mod watch;
 

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clap::Args;
 use fipa::admin::stopped::StoppedAgent;
+use fipa::config::{Effective, Sources};
 use fipa::platform::{AgentDescription, PlatformError, ServiceDescription};
 use fipa::protocol::DialogueError;
 use fipa::topics::{SubscriberStatus, TopicStatus, TopicsError};
@@ -29,8 +30,9 @@ use crate::report::Failure;
 /// all agents of this host are asked. With an agent, each subscriber is listed, too: they show why one of them gets
 /// nothing.
 ///
-/// TYPE is the media type that the publisher declares. RATE is measured over the last 32 values; the declared rate is in
-/// parentheses. BYTES is the length of the newest value.
+/// TYPE is the media type that the publisher declares. RATE is the publisher's own rate over its last 32 values. The
+/// number in parentheses is the declared rate. `fipa subscribe --rate` measures the rate at a receiver. BYTES is the
+/// length of the newest value.
 ///
 /// KEEP shows the values that a subscriber gets if it is slower than the publisher: all, or the newest ones. DELIVERED
 /// counts values that are in the queue of the subscriber, REPLACED those that a newer one replaced before they left, FAILED
@@ -44,8 +46,9 @@ Examples:
   fipa topics camera --watch
   fipa topics --json
 
-The values of a topic:
+The values of a topic, and their rate at a receiver:
   fipa subscribe camera image
+  fipa subscribe camera image --rate
 
 JSON, with --watch one array on each line:
   [ { \"agent\": name, \"topics\": null if the agent does not answer, or [ { \"name\", \"media_type\", \"rate\": declared,
@@ -121,10 +124,91 @@ async fn list(
     config: &Config,
 ) -> Result<Listed, Failure> {
     if let Some(publisher) = &arguments.agent {
-        let topics = agent.topics_of(publisher).await;
-        let topics = topics.map_err(|error| failed(&error, publisher, config))?;
-        return Ok([(publisher.name().to_owned(), Some(topics))].into());
+        return match agent.topics_of(publisher).await {
+            Ok(topics) => Ok([(publisher.name().to_owned(), Some(topics))].into()),
+            Err(error) => match no_agent(agent, publisher, config).await {
+                Some(failure) => Err(failure),
+                None => Err(failed(&error, publisher, agent, config)),
+            },
+        };
     }
+    list_all(agent, config).await
+}
+
+/// The error report if no agent has this name and an agent publishes a topic of this name.
+async fn no_agent(agent: &Arc<Agent>, name: &AgentId, config: &Config) -> Option<Failure> {
+    let name = name.name();
+    if agent.domain().directory().lookup(name).is_some() {
+        return None;
+    }
+    let (topic, publishers) = publishers_of(agent, name, config).await?;
+    let first = publishers.first()?;
+    Some(Failure::failed(
+        format!("there is no agent \"{}\"", escape(name)),
+        format!("domain {}", config.domain),
+        format!(
+            "\"{}\" is a topic of {}: fipa topics {}",
+            escape(&topic),
+            publishers.join(", "),
+            first
+        ),
+    ))
+}
+
+/// Returns the topic and its publishers as text, if there are any. The topic may have the slash of a name of ROS.
+async fn publishers_of(
+    agent: &Arc<Agent>,
+    topic: &str,
+    config: &Config,
+) -> Option<(String, Vec<String>)> {
+    let topic = topic.trim_start_matches('/');
+    let all = list_all(agent, config).await.ok()?;
+    let publishes = |topics: &Option<Vec<TopicStatus>>| {
+        let mut topics = topics.iter().flatten();
+        topics.any(|it| it.name == topic)
+    };
+    let found = all.iter().filter(|(_, topics)| publishes(topics));
+    let found: Vec<String> = found
+        .map(|(publisher, _)| escape_name(publisher).into_owned())
+        .collect();
+    (!found.is_empty()).then(|| (topic.to_owned(), found))
+}
+
+/// Maximum wait for the tip for a command line without an agent.
+const TIP_WITHIN: Duration = Duration::from_secs(3);
+
+/// The tip for `fipa subscribe` with one argument, an agent or the topic of one, if it is known.
+pub(crate) fn tip_for_one_argument(name: &str, sources: &Sources) -> Option<String> {
+    let config = Effective::load(sources).ok()?.into_config();
+    let known = Domain::names(&config).ok()?;
+    if known.is_empty() {
+        return None;
+    }
+    if known.iter().any(|it| it == name) {
+        let agent = escape_name(name);
+        return Some(format!("fipa topics {agent} lists the topics of {agent}"));
+    }
+    let found = membership::run(async {
+        let domain = membership::join_briefly(&config).await?;
+        let found = async {
+            let agent = Arc::new(asking(&domain, "topics", &config).await.ok()?);
+            publishers_of(&agent, name, &config).await
+        };
+        let found = tokio::time::timeout(TIP_WITHIN, found).await;
+        domain.close().await;
+        Ok(found.ok().flatten())
+    });
+    let (topic, publishers) = found.ok().flatten()?;
+    let topic = escape_name(&topic);
+    Some(format!(
+        "\"{topic}\" is a topic of {}: fipa subscribe {} {topic}",
+        publishers.join(", "),
+        publishers.first()?
+    ))
+}
+
+/// Lists the topics of all agents that publish some.
+async fn list_all(agent: &Arc<Agent>, config: &Config) -> Result<Listed, Failure> {
     match agent.df() {
         Ok(df) => {
             let topics = AgentDescription {
@@ -295,13 +379,18 @@ fn status(
     })
 }
 
-fn failed(error: &TopicsError, agent: &AgentId, config: &Config) -> Failure {
+fn failed(error: &TopicsError, agent: &AgentId, asking: &Agent, config: &Config) -> Failure {
     let problem = match error {
         TopicsError::Dialogue(error) => in_full(error),
         other => fipa::error::ErrorChain(other).to_string(),
     };
     let as_topic;
+    let as_stopped;
     let help = match error {
+        _ if let Some(stopped) = membership::stopped(asking, agent.name()) => {
+            as_stopped = format!("{stopped}; {}", stopped.remedy());
+            &as_stopped
+        }
         TopicsError::Dialogue(DialogueError::NotDelivered { .. })
             if let Some((publisher, topic)) = options::of_publisher(agent.name()) =>
         {
