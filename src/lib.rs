@@ -74,7 +74,8 @@
 //! # Configure
 //!
 //! [`Domain::from_environment`] reads the file named by `$FIPA_CONFIG`, else `./fipa.toml`, else
-//! `~/.config/fipa/fipa.toml`; without a file it uses the defaults, as [`Config::default`] does.
+//! `~/.config/fipa/fipa.toml`, else `/etc/fipa/fipa.toml`; without a file it uses the defaults, as
+//! [`Config::default`] does.
 //! [`Domain::open`] takes a [`Config`]. The module [`config`] has all keys.
 //!
 //! # Without an async runtime

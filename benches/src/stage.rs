@@ -179,7 +179,8 @@ impl Stage {
         let mut child = command
             .env("FIPA_RUNTIME_DIR", &self.place)
             .env("FIPA_STATE_DIR", self.place.join("state"))
-            .env_remove("FIPA_CONFIG")
+            // An empty file: no other configuration of this machine applies.
+            .env("FIPA_CONFIG", "/dev/null")
             .env_remove("HOME")
             .current_dir("/")
             .stdin(Stdio::piped())

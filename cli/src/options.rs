@@ -25,7 +25,8 @@ use crate::report::{self, Failure};
 /// host, through gateways between hosts.
 ///
 /// Every command reads one configuration file: the file given with --config, else the file named by
-/// $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml. Without a file the defaults apply.
+/// $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml, else /etc/fipa/fipa.toml. Without a file
+/// the defaults apply.
 /// A domain belongs to one user: processes of different users never share agents.
 #[derive(Debug, Parser)]
 #[command(

@@ -136,7 +136,9 @@ impl From<ConfigError> for Failure {
             other => vec![ErrorReport {
                 problem: ErrorChain(&other).to_string(),
                 place: None,
-                help: "give another file with --config or $FIPA_CONFIG, or use neither".to_owned(),
+                help: "check the permissions of the file (`ls -l`), or give another one with --config or \
+                       $FIPA_CONFIG"
+                    .to_owned(),
             }],
         };
         Self {

@@ -309,7 +309,7 @@ fn a_missing_file_is_reported() {
     let errors = "\
 error: cannot read the configuration none.toml (named by --config): \
 No such file or directory (os error 2)
- help: give another file with --config or $FIPA_CONFIG, or use neither
+ help: check the permissions of the file (`ls -l`), or give another one with --config or $FIPA_CONFIG
 ";
     assert_eq!(
         env.run(&["config", "show", "--config", "none.toml"]),

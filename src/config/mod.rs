@@ -6,8 +6,8 @@
 //!   an unknown key it suggests the nearest known one.
 //!
 //! Only the first of these files that exists is read: the one given with `--config`, the one named by
-//! `$FIPA_CONFIG`, `./fipa.toml`, `~/.config/fipa/fipa.toml`. A named file that does not exist is an
-//! error. A key that is not set has its default:
+//! `$FIPA_CONFIG`, `./fipa.toml`, `~/.config/fipa/fipa.toml`, `/etc/fipa/fipa.toml`. A named file that does not exist
+//! is an error, and so is an existing one that this user may not read. A key that is not set has its default:
 //!
 //! ```toml
 //! domain = "default"                  # processes of one domain on one host find each other

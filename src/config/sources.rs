@@ -11,6 +11,9 @@ use super::ConfigError;
 /// enough to read if `--config` names a wrong file.
 const MAX_FILE: u64 = 1 << 20;
 
+/// The directory with the configuration of all programs of the host.
+const HOST_DIR: &str = "/etc/fipa";
+
 /// The sources of a configuration: the paths to search, and the `--set` arguments that override the
 /// file.
 ///
@@ -30,6 +33,9 @@ pub struct Sources {
     pub current_dir: Option<PathBuf>,
     /// The home directory: may contain `.config/fipa/fipa.toml`.
     pub home: Option<PathBuf>,
+    /// The directory with the configuration of all programs of the host: may contain `fipa.toml`, which is read if no
+    /// other place has a file.
+    pub host_dir: Option<PathBuf>,
     /// The name of this host, for the default of `mts.name`.
     pub host_name: String,
 }
@@ -45,6 +51,7 @@ impl Sources {
             domain: env::var_os("FIPA_DOMAIN").map(|name| name.to_string_lossy().into_owned()),
             current_dir: env::current_dir().ok(),
             home: env::home_dir(),
+            host_dir: Some(PathBuf::from(HOST_DIR)),
             host_name: gethostname::gethostname().to_string_lossy().into_owned(),
         }
     }
@@ -78,9 +85,11 @@ impl Sources {
             .home
             .as_ref()
             .map(|home| home.join(".config/fipa/fipa.toml"));
+        let of_host = self.host_dir.as_ref().map(|it| it.join("fipa.toml"));
         let usual = [
             (local, "found in the current directory"),
             (of_user, "found in the home directory"),
+            (of_host, "for all programs of this host"),
         ];
         for (path, named_by) in usual {
             let Some(path) = path else { continue };

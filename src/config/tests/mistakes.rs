@@ -440,6 +440,25 @@ fn a_named_file_must_be_there() {
 }
 
 #[test]
+fn the_file_of_the_host_is_never_skipped() {
+    let directory = tempfile::tempdir().unwrap();
+    let sources = Sources {
+        host_dir: Some(directory.path().to_owned()),
+        ..Sources::default()
+    };
+    assert!(Config::load(&sources).is_ok());
+    let file = directory.path().join("fipa.toml");
+    fs::create_dir(&file).unwrap();
+    assert_eq!(
+        chain(&Config::load(&sources).unwrap_err()),
+        format!(
+            "cannot read the configuration {} (for all programs of this host): Is a directory (os error 21)",
+            file.display()
+        )
+    );
+}
+
+#[test]
 fn a_found_file_must_be_readable_text() {
     let directory = tempfile::tempdir().unwrap();
     let sources = Sources {

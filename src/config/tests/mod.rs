@@ -269,11 +269,13 @@ fn the_first_file_counts() {
     let variable = write("variable.toml", "variable");
     let local = write("here/fipa.toml", "local");
     let of_user = write("home/.config/fipa/fipa.toml", "user");
+    let of_host = write("etc/fipa.toml", "host");
     let mut sources = Sources {
         file: Some(asked.clone()),
         variable: Some(variable.clone()),
         current_dir: Some(directory.path().join("here")),
         home: Some(directory.path().join("home")),
+        host_dir: Some(directory.path().join("etc")),
         ..Sources::default()
     };
     let loaded = |sources: &Sources| {
@@ -297,6 +299,8 @@ fn the_first_file_counts() {
     fs::remove_file(local).unwrap();
     assert_eq!(loaded(&sources), ("user".to_owned(), Some(of_user.clone())));
     fs::remove_file(of_user).unwrap();
+    assert_eq!(loaded(&sources), ("host".to_owned(), Some(of_host.clone())));
+    fs::remove_file(of_host).unwrap();
     assert_eq!(loaded(&sources), ("default".to_owned(), None));
 }
 

@@ -158,7 +158,8 @@ impl Processes {
             .args(["--set", "mts.transports=shm,unix,tcp"])
             .args(["--set", set])
             .env("FIPA_RUNTIME_DIR", self.runtime_dir.path())
-            .env_remove("FIPA_CONFIG")
+            // An empty file: no other configuration of this machine applies.
+            .env("FIPA_CONFIG", "/dev/null")
             .current_dir("/")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
