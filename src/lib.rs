@@ -150,4 +150,4 @@ pub use fipa_transport::{Attempt, FailureReason, Incarnation, Kind, Location, Ou
 #[doc(hidden)]
 pub use fipa_transport::{fnv1a, log_limit, threads};
 #[cfg(feature = "net")]
-pub use gateway::{Gateway, Neighbor};
+pub use gateway::{Gateway, Neighbor, SelfCheck, SelfCheckError};

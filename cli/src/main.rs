@@ -19,6 +19,7 @@ mod membership;
 mod options;
 mod output;
 mod report;
+mod service_manager;
 mod signals;
 
 use std::fmt::{self, Debug};

@@ -17,6 +17,7 @@ mod namesakes;
 mod neighbors;
 mod platform_agents;
 mod publish_pace;
+mod self_check;
 mod state;
 
 use std::collections::BTreeMap;
@@ -53,6 +54,8 @@ use self::namesakes::Namesakes;
 pub use self::neighbors::Neighbor;
 use self::neighbors::{Neighbors, View};
 use self::platform_agents::PlatformAgents;
+use self::self_check::Arrivals;
+pub use self::self_check::{SelfCheck, SelfCheckError};
 #[cfg(feature = "fuzzing")]
 pub(crate) use self::state::play as play_state;
 use self::state::{Predecessor, StateFile, Trust};
@@ -77,6 +80,8 @@ pub struct Gateway {
     neighbors: Arc<Neighbors>,
     exchange: Arc<Exchanging>,
     state: Arc<StateFile>,
+    /// The letters of the gateway to itself that have arrived.
+    arrivals: Arrivals,
     tasks: Vec<JoinHandle<()>>,
 }
 
@@ -169,6 +174,7 @@ impl Gateway {
             neighbors: Arc::clone(&known_peers.neighbors),
             exchange,
             state,
+            arrivals: Arrivals::default(),
             tasks: Vec::new(),
         };
         // The queue is created first, because letters arrive as soon as the name is registered.
@@ -243,6 +249,7 @@ impl Gateway {
             neighbors: Arc::clone(&self.neighbors),
             view: Arc::clone(&self.view),
             exchange: Arc::clone(&self.exchange),
+            arrivals: self.arrivals.clone(),
             known_peers,
             configuration: Arc::clone(&self.configuration),
             refusals,
@@ -379,6 +386,16 @@ impl Gateway {
     #[must_use]
     pub fn reload_requests(&self) -> ReloadRequests {
         self.service.reload_requests()
+    }
+
+    /// Returns a check of whether the gateway delivers letters.
+    #[must_use]
+    pub fn self_check(&self) -> SelfCheck {
+        SelfCheck {
+            service: Arc::clone(&self.service),
+            view: Arc::clone(&self.view),
+            arrivals: self.arrivals.clone(),
+        }
     }
 
     /// Returns the current problem of the discovery of other hosts, if there is one, and its changes.

@@ -11,6 +11,7 @@ use crate::membership::{self, SignalRequest, Stop};
 use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
+use crate::service_manager;
 
 /// Run the gateway, which connects the agents of this host with agents on other hosts
 ///
@@ -21,6 +22,9 @@ use crate::report::Failure;
 /// On `fipa reload` and SIGHUP (`kill -HUP`) the gateway reads its configuration again and loses no letter. It applies
 /// the order of mts.transports, mts.deadline, [routes], [access] and discovery.static, and warns about changes
 /// that take effect only after a restart.
+///
+/// Under systemd, the gateway reports when it is ready, reloads and stops (Type=notify). With WatchdogSec= it also
+/// reports that it works, each time after it has passed a letter to itself.
 ///
 /// The command prints the gateway's name and addresses on standard output. With -v it logs on
 /// standard error when agents join and leave.
@@ -62,6 +66,9 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
     } else {
         output::text(&ready(config, &gateway, problem.as_deref()))?;
     }
+    let name = escape_name(gateway.name());
+    service_manager::ready(&format!("gateway {name} of domain {}", config.domain));
+    let watchdog = service_manager::start_watchdog(gateway.self_check());
     loop {
         tokio::select! {
             request = stop.next_request() => match request {
@@ -88,6 +95,10 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
         }
     }
     log_limit::info!("stopping the gateway");
+    service_manager::stopping();
+    if let Some(watchdog) = watchdog {
+        watchdog.abort();
+    }
     Stop::ending();
     gateway.close().await;
     Ok(())
@@ -95,7 +106,16 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
 
 /// Reads the configuration again, and applies it. An invalid configuration changes nothing.
 fn reload(gateway: &mut Gateway, global: &Global) -> Result<Reloaded, ConfigError> {
-    gateway.reload(&global.effective()?.into_config())
+    service_manager::reloading();
+    let reloaded = global
+        .effective()
+        .and_then(|effective| gateway.reload(&effective.into_config()));
+    let status = match reloaded {
+        Ok(_) => "configuration reloaded",
+        Err(_) => "continuing with the previous configuration, because the new one has errors",
+    };
+    service_manager::ready(status);
+    reloaded
 }
 
 fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {

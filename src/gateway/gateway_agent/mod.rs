@@ -28,6 +28,7 @@ use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
 use super::introductions::Grounds;
 use super::namesakes::Namesakes;
 use super::neighbors::Neighbors;
+use super::self_check::Arrivals;
 use crate::admin::contact::{self, Introduced};
 use crate::admin::routes;
 use crate::domain::service::Service;
@@ -46,6 +47,7 @@ pub(crate) struct GatewayAgent {
     pub(crate) neighbors: Arc<Neighbors>,
     pub(crate) view: Arc<dyn Directory>,
     pub(super) exchange: Arc<Exchanging>,
+    pub(super) arrivals: Arrivals,
     pub(super) known_peers: Arc<KnownPeers>,
     /// The values of the configuration in use, by key.
     pub(super) configuration: Arc<Mutex<BTreeMap<String, String>>>,
@@ -127,6 +129,9 @@ impl GatewayAgent {
             && received.service == sender
         {
             return self.log_notice(sender, message);
+        }
+        if self.arrivals.handle(message, received) {
+            return;
         }
         if message.ontology() == Some(presence::ONTOLOGY) {
             return self.handle_presence(message, received);
