@@ -25,6 +25,7 @@ pub use fipa_transport::{
     Forked, IncarnationError, ListenError, LocationError, TransportError, TransportErrorKind,
 };
 
+use crate::Config;
 #[cfg(feature = "secure")]
 use crate::admin::keys::KeysError;
 use crate::config::{ConfigError, RuleError};
@@ -104,7 +105,7 @@ pub enum OpenError {
 
 impl OpenError {
     /// Replaces an error that was caused by a directory of the domain in which no file can be written.
-    pub(crate) fn explained(self, domain: &str) -> Self {
+    pub(crate) fn explained(self, config: &Config) -> Self {
         let may_be_caused = matches!(
             self,
             Self::DomainDir(DomainDirError::Io { .. })
@@ -116,7 +117,7 @@ impl OpenError {
         if !may_be_caused {
             return self;
         }
-        match DomainDir::of(domain).check_writable() {
+        match DomainDir::of(config).check_writable() {
             Err(cause) => cause.into(),
             Ok(()) => self,
         }

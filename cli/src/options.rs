@@ -159,7 +159,8 @@ Exit codes:
 Environment:
   FIPA_CONFIG       configuration file, unless --config is given
   FIPA_DOMAIN       domain, unless --set domain=NAME is given; overrides the file
-  FIPA_RUNTIME_DIR  directory in which the processes of a domain meet; default: /tmp/fipa-<user id>
+  FIPA_RUNTIME_DIR  directory in which the processes of a domain meet; default: runtime_dir of the file, else
+                    /tmp/fipa-<user id>
   FIPA_STATE_DIR    directory of the state of `fipa own`; default: ~/.local/state/fipa
   RUST_LOG          log filter, for example fipa_mts=debug; overrides -v and -q
   NO_COLOR          when set, the output has no colors

@@ -86,6 +86,7 @@ fn show_prints_an_equivalent_configuration_file() {
     let shown = env.run(&["config", "show", "--set", "mts.deadline=9s"]);
     let expected = "\
 domain = \"lab\"                       # fipa.toml:1
+runtime_dir = \"\"                     # default
 
 [mts]
 name = \"sherpa\"                      # fipa.toml:3

@@ -8,7 +8,7 @@ use std::net::TcpListener;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use common::{Host, Running};
+use common::{Host, Ran, Running};
 use fipa_testbed::until;
 use serde_json::{Value, json};
 
@@ -102,6 +102,30 @@ fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
         assert!(!log.contains("ERROR"), "{log}");
     }
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn processes_meet_in_the_configured_runtime_directory() {
+    let host = Host::new();
+    let configured = host.path("configured");
+    let set = format!("runtime_dir={}", configured.display());
+    let command = |arguments: &[&str]| {
+        let mut command = host.command(&[&["--set", &set], arguments].concat());
+        command.env_remove("FIPA_RUNTIME_DIR");
+        command
+    };
+    let gateway = Running::new(command(&["up", "--json", "--set", "mts.name=sherpa"]));
+    let listed = Ran::from(command(&["agents", "--json"]).output().unwrap()).done_json();
+    assert_eq!(listed["gateway"], "sherpa");
+    assert!(configured.join(&host.domain).is_dir());
+    let listed = host.run(&["--set", &set, "agents", "--json"]).done_json();
+    assert_eq!(
+        listed["gateway"],
+        Value::Null,
+        "the variable precedes the key"
+    );
+    let (code, log) = gateway.signal("-INT");
+    assert_eq!(code, Some(0), "{log}");
 }
 
 #[test]

@@ -53,14 +53,14 @@ pub struct ReloadedProcess {
 /// up to five seconds if a process does not answer. Must be called within a tokio runtime.
 ///
 /// # Errors
-/// If the configuration, of which only the domain matters, is invalid, or the directory of the domain cannot be used.
+/// If the configuration, of which only the domain and its place matter, is invalid, or the directory of the domain cannot be used.
 pub async fn request(config: &Config) -> Result<Vec<ReloadedProcess>, OpenError> {
     config.check()?;
     tokio::runtime::Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
     let name = format!("fipa-reload-{}", std::process::id());
     let own = fipa_sds::MtsId::new(name, Incarnation::random());
     let membership = Membership::default();
-    let (dir, host) = membership::join(&config.domain, &own, membership, &Cancellation::new())?;
+    let (dir, host) = membership::join(config, &own, membership, &Cancellation::new())?;
     let member = Member { dir, host };
     let socket = member.host.listen()?;
     let socket = socket::listening(socket).map_err(OpenError::Watch)?;

@@ -100,6 +100,7 @@ impl Finding {
 pub(super) fn findings(config: &Config) -> Vec<Finding> {
     let mut found = Findings(Vec::new());
     found.domain(&config.domain);
+    found.runtime_dir(&config.runtime_dir);
     found.mts(config);
     found.routes(config);
     found.shm(&config.transport.shm);
@@ -169,6 +170,16 @@ impl Findings {
                     "it becomes part of file names: use 1 to {} of A-Z a-z 0-9 _ -",
                     MAX_DOMAIN
                 ),
+            );
+        }
+    }
+
+    fn runtime_dir(&mut self, directory: &str) {
+        if !directory.is_empty() && !directory.starts_with('/') {
+            self.add(
+                &["runtime_dir"],
+                format_args!("cannot be {directory:?}, which differs between working directories"),
+                "write the full path, for example /run/fipa",
             );
         }
     }

@@ -115,6 +115,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::Text(config.domain.clone()),
     },
     Key {
+        path: &["runtime_dir"],
+        shape: Shape::Text,
+        expected: r#"a directory such as "/run/fipa", or "" for the one in /tmp"#,
+        write: |config, value| text(value).map(|dir| config.runtime_dir = dir),
+        read: |config| Value::Text(config.runtime_dir.clone()),
+    },
+    Key {
         path: &["mts", "name"],
         shape: Shape::Text,
         expected: "a name of 1 to 255 bytes",

@@ -11,6 +11,7 @@
 //!
 //! ```toml
 //! domain = "default"                  # processes of one domain on one host find each other
+//! runtime_dir = ""                    # directory in which the processes meet; empty: /tmp/fipa-<user id>
 //! [mts]
 //! name = "sherpa-mts"                 # default: <host name>-mts
 //! transports = ["shm", "unix", "tcp"] # in order of preference; others are off
@@ -110,6 +111,9 @@ pub struct Config {
     /// `domain`: the domain. Processes of one domain on one host find each other. Part of paths and of
     /// the names of shared memory: 1 to 32 of `A-Z a-z 0-9 _ -`.
     pub domain: String,
+    /// `runtime_dir`: the directory with a directory for each domain, in which its processes meet; `/tmp/fipa-<user id>`
+    /// if it is empty. `$FIPA_RUNTIME_DIR` precedes it.
+    pub runtime_dir: String,
     /// `[mts]`: the message transport service of this process.
     pub mts: MtsConfig,
     /// `[routes]`: the orders of transports for particular receivers. The first match counts; entries
@@ -468,6 +472,7 @@ impl Config {
         };
         Self {
             domain: "default".to_owned(),
+            runtime_dir: String::new(),
             mts: MtsConfig {
                 name: keys::default_mts_name(host_name),
                 transports: vec![Kind::Shm, Kind::Unix, Kind::Tcp],

@@ -1,14 +1,14 @@
 //! The private directory that the processes of a domain share on one host.
 //!
-//! Its path is `$FIPA_RUNTIME_DIR/<domain>`, or `/tmp/fipa-<uid>/<domain>`, which is the same for a
-//! login shell and a service of the same user. Both levels belong to the user and have mode 0700.
-//! The last process that leaves removes the lower level. The upper level stays: `$FIPA_RUNTIME_DIR`
+//! Its path is `$FIPA_RUNTIME_DIR/<domain>`, or `<runtime_dir>/<domain>` with the key of the configuration, or
+//! `/tmp/fipa-<uid>/<domain>`, which is the same for a login shell and a service of the same user. Both levels belong to the user and have mode 0700.
+//! The last process that leaves removes the lower level. The upper level stays: a configured one
 //! belongs to its owner, and in `/tmp` another user could take the name (see `user_dir`).
 //!
 //! Cleaners of `/tmp` remove old files. Every process holds a shared lock on both levels, which
 //! systemd-tmpfiles respects, and renews the timestamps once a day for other cleaners.
 
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::fs::{self, DirBuilder};
 use std::io;
 use std::io::Write as _;
@@ -23,6 +23,7 @@ use fipa_transport::{fnv1a, log_limit};
 use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
+use crate::Config;
 use crate::domain::user_dir::{Holder, UserDir, user_name};
 
 /// The environment variable with the directory of all domains, instead of that in `/tmp`.
@@ -120,11 +121,11 @@ impl DomainDir {
     pub(crate) const NEXT_STATE: &str = "gateway.state.new";
 
     /// Creates the directory of a domain, and checks that it is private.
-    pub(crate) fn prepare(domain: &str) -> Result<Self, DomainDirError> {
-        let mut dir = Self::of(domain);
+    pub(crate) fn prepare(config: &Config) -> Result<Self, DomainDirError> {
+        let mut dir = Self::of(config);
         if make_private(&dir.base).is_err() {
             // Another user may have taken the name in between.
-            dir = Self::of(domain);
+            dir = Self::of(config);
             make_private(&dir.base)?;
         }
         make_private(&dir.path())?;
@@ -139,8 +140,10 @@ impl DomainDir {
     }
 
     /// Returns the directory of a domain without creating or examining it.
-    pub(crate) fn of(domain: &str) -> Self {
-        let named = std::env::var_os(VARIABLE).filter(|value| !value.is_empty());
+    pub(crate) fn of(config: &Config) -> Self {
+        let variable = std::env::var_os(VARIABLE);
+        let named = [variable, Some(OsString::from(&config.runtime_dir))];
+        let named = named.into_iter().flatten().find(|it| !it.is_empty());
         let (base, name_held_by) = match named {
             // A relative path would name another directory in each working directory.
             Some(base) => {
@@ -156,7 +159,7 @@ impl DomainDir {
         Self {
             base,
             name_held_by,
-            domain: domain.to_owned(),
+            domain: config.domain.clone(),
             locks: None,
         }
     }

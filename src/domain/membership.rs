@@ -35,7 +35,7 @@ impl Domain {
 
     /// Reads the directory of a domain without joining the domain. The result is sorted by name.
     pub(crate) fn peek(config: &Config) -> Result<Vec<Arc<Entry>>, OpenError> {
-        let dir = DomainDir::of(&config.domain);
+        let dir = DomainDir::of(config);
         if !dir.exists()? {
             return Ok(Vec::new());
         }
@@ -54,7 +54,7 @@ pub(crate) struct Membership {
 
 /// Creates the directory of the domain and joins the agent directory of the host in it.
 pub(crate) fn join(
-    domain: &str,
+    config: &Config,
     own: &fipa_sds::MtsId,
     Membership { gateway, brief }: Membership,
     cancellation: &Cancellation,
@@ -62,14 +62,14 @@ pub(crate) fn join(
     let mut tries = 0;
     loop {
         tries += 1;
-        let mut dir = DomainDir::prepare(domain)?;
-        let config = HostConfig {
+        let mut dir = DomainDir::prepare(config)?;
+        let host = HostConfig {
             dir: dir.part("directory"),
             mts: own.clone(),
             gateway,
             brief,
         };
-        let joined = HostDirectory::open_unless(config, cancellation);
+        let joined = HostDirectory::open_unless(host, cancellation);
         match joined {
             Ok(host) => {
                 // Not earlier, because a leaving process may still remove an empty directory.

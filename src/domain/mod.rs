@@ -180,7 +180,7 @@ impl Domain {
         let config = config.clone();
         let opened = background::run(&runtime, move |cancellation| {
             let joined = Self::join(&config, brief, cancellation);
-            joined.map_err(|error| error.explained(&config.domain))
+            joined.map_err(|error| error.explained(&config))
         });
         opened.await?
     }

@@ -126,7 +126,7 @@ impl Service {
             gateway: role.gateway,
             brief: role.brief,
         };
-        let (dir, host) = membership::join(&config.domain, &own, membership, cancellation)?;
+        let (dir, host) = membership::join(config, &own, membership, cancellation)?;
         let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| dir.leave())?;
         let gate = gate(config, &role, &host).inspect_err(|_| dir.leave())?;
         let watchers = Arc::new(Watchers::new(&own, role.gateway));

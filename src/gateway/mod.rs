@@ -101,7 +101,7 @@ impl Gateway {
         let config = config.clone();
         let opened = background::run(&runtime, move |cancellation| {
             let started = Self::start(&config, cancellation);
-            started.map_err(|error| error.explained(&config.domain))
+            started.map_err(|error| error.explained(&config))
         });
         opened.await?
     }

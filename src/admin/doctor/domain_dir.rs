@@ -12,7 +12,7 @@ use crate::domain::user_dir::Holder;
 const AREA: Area = Area("domain");
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
-    let dir = DomainDir::of(&config.domain);
+    let dir = DomainDir::of(config);
     checks.push(directory(&dir));
     checks.push(writing(&dir));
 }

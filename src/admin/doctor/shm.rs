@@ -35,7 +35,7 @@ const FEW_INSTANCES: u64 = 64;
 const FIRST_REGULAR_USER: u32 = 1000;
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
-    let dir = DomainDir::of(&config.domain);
+    let dir = DomainDir::of(config);
     let settings = ShmConfig {
         capacity: config.transport.shm.capacity,
         ..ShmConfig::new(dir.part("shm"), dir.prefix(), Incarnation::random())

@@ -78,7 +78,7 @@ impl Watcher {
         let name = format!("fipa-watch-{}", std::process::id());
         let own = fipa_sds::MtsId::new(name, Incarnation::random());
         let membership = Membership::default();
-        let (dir, host) = membership::join(&config.domain, &own, membership, &Cancellation::new())?;
+        let (dir, host) = membership::join(config, &own, membership, &Cancellation::new())?;
         let socket = host.listen().inspect_err(|_| leave(&host, &dir))?;
         let socket = socket::listening(socket).map_err(|source| {
             leave(&host, &dir);

@@ -20,18 +20,18 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "deadline = \"5s\"\n",
             "fipa.toml:1: unknown key `deadline`; did you mean `mts.deadline`? \
-             (known at the top: domain, mts, transport, discovery, security, contacts, access, monitor, \
+             (known at the top: domain, runtime_dir, mts, transport, discovery, security, contacts, access, monitor, \
              platform, routes)",
         ),
         (
             "[discover]\nmdns = true\n",
             "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
-             (known at the top: domain, mts, transport, discovery, security, contacts, access, monitor, \
+             (known at the top: domain, runtime_dir, mts, transport, discovery, security, contacts, access, monitor, \
              platform, routes)",
         ),
         (
             "[radio]\nrate = 1\n",
-            "fipa.toml:1: unknown key `radio`; known at the top: domain, mts, transport, discovery, \
+            "fipa.toml:1: unknown key `radio`; known at the top: domain, runtime_dir, mts, transport, discovery, \
              security, contacts, access, monitor, platform, routes",
         ),
         (
@@ -164,6 +164,11 @@ fn mistakes_are_reported_with_line_and_key() {
             "domain = \"abcdefghijabcdefghijabcdefghij123\"\n",
             "fipa.toml:1: `domain` cannot be \"abcdefghijabcdefghijabcdefghij123\"; \
              it becomes part of file names: use 1 to 32 of A-Z a-z 0-9 _ -",
+        ),
+        (
+            "runtime_dir = \"run\"\n",
+            "fipa.toml:1: `runtime_dir` cannot be \"run\", which differs between working directories; \
+             write the full path, for example /run/fipa",
         ),
         (
             "[mts]\nname = \"a\\nb\"\n",

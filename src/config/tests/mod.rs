@@ -106,6 +106,7 @@ fn every_key_is_read() {
     let config = config(
         r#"
         domain = "lab_2"
+        runtime_dir = "/run/fipa"
         mts = { name = "crex", transports = ["tcp"], deadline = "1m 30s", queue = 8 }
         [routes]
         "camera_.*" = ["shm", "tcp"]
@@ -149,6 +150,7 @@ fn every_key_is_read() {
         &[],
     );
     assert_eq!(config.domain, "lab_2");
+    assert_eq!(config.runtime_dir, "/run/fipa");
     assert_eq!(config.mts.name, "crex");
     assert_eq!(config.mts.transports, [Kind::Tcp]);
     assert_eq!(config.mts.deadline, Duration::from_secs(90));
@@ -321,6 +323,7 @@ static = { crex-mts = ["tcp://10.0.0.2:7788"] }
 "#;
     let effective = load(file, &["mts.deadline=90s", "routes.'a b'=tcp"]).unwrap();
     let expected = r#"domain = "lab"                       # fipa.toml:2
+runtime_dir = ""                     # default
 
 [mts]
 name = "sherpa-mts"                  # default
@@ -429,6 +432,7 @@ fn a_file_name_with_newlines_is_escaped_in_rendered_comments() {
 prop_compose! {
     fn configs()(
         domain in "[A-Za-z0-9_-]{1,32}",
+        runtime_dir in "(/[a-z é\"]{1,9}){0,3}",
         name in names(),
         transports in kinds(),
         deadline in 1..=3_600_000_000_000_u64,
@@ -447,6 +451,7 @@ prop_compose! {
     ) -> Config {
         let mut config = Config::for_host("sherpa");
         config.domain = domain;
+        config.runtime_dir = runtime_dir;
         config.mts.name = name;
         config.mts.transports = transports;
         config.mts.deadline = Duration::from_nanos(deadline);
