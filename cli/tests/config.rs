@@ -365,6 +365,47 @@ fn the_first_existing_file_is_used() {
 }
 
 #[test]
+fn the_configuration_of_the_debian_package_opens_no_port() {
+    let env = Environment::new();
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/debian/fipa.toml");
+    let checked = env.run(&["config", "check", "--config", file]);
+    assert_eq!((checked.code, checked.stderr.as_str()), (Some(0), ""));
+    let shown = env
+        .run(&["config", "show", "--json", "--config", file])
+        .json();
+    let settings = shown["settings"].as_array().unwrap();
+    for (path, value) in [
+        (json!(["transport", "tcp", "listen"]), json!([])),
+        (json!(["discovery", "mdns"]), json!(false)),
+        (json!(["runtime_dir"]), json!("/run/fipa")),
+    ] {
+        let setting = settings.iter().find(|it| it["path"] == path).unwrap();
+        assert_eq!(setting["value"], value);
+    }
+    // Its proposals for other hosts are valid, too.
+    let text = fs::read_to_string(file).unwrap();
+    let enabled = text
+        .replace("\nlisten = []\n", "\n")
+        .replace("\nmdns = false\n", "\n")
+        .replace("\n#[", "\n[")
+        .replace("\n#listen", "\nlisten")
+        .replace("\n#keys", "\nkeys");
+    env.write("enabled.toml", &enabled);
+    let shown = env.run(&["config", "show", "--config", "../enabled.toml"]);
+    assert_eq!((shown.code, shown.stderr.as_str()), (Some(0), ""));
+    assert!(
+        shown.stdout.contains("listen = [\"*:7788\"]"),
+        "{}",
+        shown.stdout
+    );
+    assert!(
+        shown.stdout.contains("keys = \"/var/lib/fipa/keys\""),
+        "{}",
+        shown.stdout
+    );
+}
+
+#[test]
 fn an_invalid_command_line_has_exit_code_2() {
     let env = Environment::new();
     for arguments in [
