@@ -53,7 +53,8 @@ pub struct ReloadedProcess {
 /// up to five seconds if a process does not answer. Must be called within a tokio runtime.
 ///
 /// # Errors
-/// If the configuration, of which only the domain and its place matter, is invalid, or the directory of the domain cannot be used.
+/// If the configuration, of which only the domain and its place matter, is invalid, or the directory of the domain
+/// cannot be used.
 pub async fn request(config: &Config) -> Result<Vec<ReloadedProcess>, OpenError> {
     config.check()?;
     tokio::runtime::Handle::try_current().map_err(|_| OpenError::NoRuntime)?;

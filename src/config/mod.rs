@@ -111,8 +111,8 @@ pub struct Config {
     /// `domain`: the domain. Processes of one domain on one host find each other. Part of paths and of
     /// the names of shared memory: 1 to 32 of `A-Z a-z 0-9 _ -`.
     pub domain: String,
-    /// `runtime_dir`: the directory with a directory for each domain, in which its processes meet; `/tmp/fipa-<user id>`
-    /// if it is empty. `$FIPA_RUNTIME_DIR` precedes it.
+    /// `runtime_dir`: the directory with a directory for each domain, in which its processes meet;
+    /// `/tmp/fipa-<user id>` if it is empty. `$FIPA_RUNTIME_DIR` precedes it.
     pub runtime_dir: String,
     /// `[mts]`: the message transport service of this process.
     pub mts: MtsConfig,

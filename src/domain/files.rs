@@ -1,8 +1,8 @@
 //! The private directory that the processes of a domain share on one host.
 //!
 //! Its path is `$FIPA_RUNTIME_DIR/<domain>`, or `<runtime_dir>/<domain>` with the key of the configuration, or
-//! `/tmp/fipa-<uid>/<domain>`, which is the same for a login shell and a service of the same user. Both levels belong to the user and have mode 0700.
-//! The last process that leaves removes the lower level. The upper level stays: a configured one
+//! `/tmp/fipa-<uid>/<domain>`, which is the same for a login shell and a service of the same user. Both levels belong
+//! to the user and have mode 0700. The last process that leaves removes the lower level. The upper level stays: a configured one
 //! belongs to its owner, and in `/tmp` another user could take the name (see `user_dir`).
 //!
 //! Cleaners of `/tmp` remove old files. Every process holds a shared lock on both levels, which

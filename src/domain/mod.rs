@@ -140,7 +140,8 @@ pub struct RegisterOptions {
 impl Domain {
     /// Joins the domain of the configuration that the environment of this process selects: the file
     /// named by `$FIPA_CONFIG`, else `./fipa.toml`, else `~/.config/fipa/fipa.toml`, else
-    /// `/etc/fipa/fipa.toml`, else the defaults. See [`open`](Self::open). The process [follows](Self::follow) the configuration.
+    /// `/etc/fipa/fipa.toml`, else the defaults. See [`open`](Self::open). The process [follows](Self::follow) the
+    /// configuration.
     ///
     /// # Errors
     /// If the file cannot be read or has mistakes, or as for [`open`](Self::open).

@@ -14,7 +14,8 @@ use crate::report::Failure;
 ///
 /// The configuration is one TOML file: the file given with --config, else the file named by
 /// $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml, else /etc/fipa/fipa.toml. No other
-/// file is read. Keys that the file does not set have their defaults. $FIPA_DOMAIN overrides the domain of the file. --set KEY=VALUE overrides single keys.
+/// file is read. Keys that the file does not set have their defaults. $FIPA_DOMAIN overrides the
+/// domain of the file. --set KEY=VALUE overrides single keys.
 #[derive(Debug, Subcommand)]
 #[command(after_help = "\
 Examples:
