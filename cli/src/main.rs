@@ -35,7 +35,7 @@ use tracing_subscriber::fmt::format::{self, Writer};
 
 fn main() -> ExitCode {
     complete::answer();
-    let command_line = options::CommandLine::read();
+    let command_line = options::CommandLine::read(command::topics::tip_for_one_argument);
     log_to_stderr(&command_line.global);
     command_line.global.keep_sources();
     if let Err(error) = fipa::admin::open_files::raise() {

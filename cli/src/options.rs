@@ -17,7 +17,7 @@ use fipa::threads;
 use fipa_acl::escape_name;
 use tokio::runtime;
 
-use crate::command::{Command, topics};
+use crate::command::Command;
 use crate::complete;
 use crate::report::{self, Failure};
 
@@ -43,19 +43,26 @@ pub(crate) struct CommandLine {
     pub(crate) command: Command,
 }
 
+/// Returns the tip for a command with the name of an agent or a topic where it needs both.
+pub(crate) type TopicTip = fn(&str, &Sources) -> Option<String>;
+
 impl CommandLine {
     /// Parses the command line of this process. Ends the process after printing an error or the help.
     ///
     /// The global options are accepted before and after the command. They are defined at every level
     /// and merged here, because clap's own global options lose the value given before the command
     /// when the option is also given after it.
-    pub(crate) fn read() -> Self {
+    pub(crate) fn read(publisher_of: TopicTip) -> Self {
         let matches = command().try_get_matches();
         let matches = matches.unwrap_or_else(|error| {
             let arguments: Vec<_> = std::env::args_os()
                 .map(|it| it.to_string_lossy().into_owned())
                 .collect();
-            report::usage(&with_topic(with_meant_command(error), &arguments))
+            report::usage(&with_topic(
+                with_meant_command(error),
+                &arguments,
+                publisher_of,
+            ))
         });
         let read = || {
             let mut line = Self::from_arg_matches(&matches)?;
@@ -107,11 +114,11 @@ fn with_meant_command(mut error: clap::Error) -> clap::Error {
 
 /// Splits the path of a topic of ROS, where `fipa subscribe` has two arguments. Names the agent that publishes a topic
 /// if only the topic is given.
-fn with_topic(mut error: clap::Error, arguments: &[String]) -> clap::Error {
+fn with_topic(mut error: clap::Error, arguments: &[String], publisher_of: TopicTip) -> clap::Error {
     if error.kind() == ErrorKind::MissingRequiredArgument
         && let Some(at) = arguments.iter().position(|it| it == "subscribe")
         && let Some(name) = arguments.get(at + 1)
-        && let Some(tip) = missing_topic(name)
+        && let Some(tip) = missing_topic(name, publisher_of)
     {
         let tips = ContextValue::StyledStrs(vec![tip.into()]);
         error.insert(ContextKind::Suggested, tips);
@@ -120,12 +127,12 @@ fn with_topic(mut error: clap::Error, arguments: &[String]) -> clap::Error {
 }
 
 /// The tip for `fipa subscribe` with this argument alone.
-fn missing_topic(name: &str) -> Option<String> {
+fn missing_topic(name: &str, publisher_of: TopicTip) -> Option<String> {
     match of_publisher(name) {
         Some((publisher, topic)) => Some(format!(
             "the agent and the topic are two arguments: fipa subscribe {publisher} {topic}"
         )),
-        None => topics::tip_for_one_argument(name, &complete::sources(std::env::args_os())),
+        None => publisher_of(name, &complete::sources(std::env::args_os())),
     }
 }
 
