@@ -26,6 +26,26 @@ pub(crate) struct TestDomain {
     pub(crate) runtime: Runtime,
     pub(crate) directory: tempfile::TempDir,
     pub(crate) prefix: String,
+    _remains: Remains,
+}
+
+/// Files in shared memory that are left at the end of a test. If the process ends at once, a thread that has just
+/// answered a letter may still own the last part of an endpoint, and does not remove the files.
+struct Remains(String);
+
+impl Drop for Remains {
+    fn drop(&mut self) {
+        for entry in std::fs::read_dir("/dev/shm")
+            .into_iter()
+            .flatten()
+            .flatten()
+        {
+            if entry.file_name().to_string_lossy().starts_with(&self.0) {
+                // The endpoint may have removed it meanwhile.
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+    }
 }
 
 impl TestDomain {
@@ -35,9 +55,11 @@ impl TestDomain {
             .enable_all()
             .build()
             .unwrap();
+        let prefix = format!("fipatest-{}", Incarnation::random());
         Self {
             directory: tempfile::tempdir().unwrap(),
-            prefix: format!("fipatest-{}", Incarnation::random()),
+            _remains: Remains(prefix.clone()),
+            prefix,
             runtime,
         }
     }
