@@ -48,6 +48,12 @@ impl StoppedAgent {
     pub fn remedy(&self) -> String {
         format!("continue it: `kill -CONT {}`", self.process)
     }
+
+    /// Returns the text with the remedy.
+    #[must_use]
+    pub fn advice(&self) -> String {
+        format!("{self}; {}", self.remedy())
+    }
 }
 
 impl Display for StoppedAgent {

@@ -61,7 +61,7 @@ pub(crate) fn of<T>(
                 disk.apply(scene.path(), step);
             }
             let remains = tempfile::tempdir().unwrap();
-            let mut random = Random(round << 32 | done as u64);
+            let mut random = fastrand::Rng::with_seed(round << 32 | done as u64);
             disk.write(remains.path(), &mut random);
             after(remains.path(), (done == steps.len()).then_some(&value));
             cuts += 1;
@@ -168,10 +168,10 @@ impl Disk {
     }
 
     /// Writes what remains after a cut.
-    fn write(&self, root: &Path, random: &mut Random) {
+    fn write(&self, root: &Path, random: &mut fastrand::Rng) {
         let mut nodes: BTreeMap<&Path, Node> = BTreeMap::new();
         for change in &self.changes {
-            if !change.unsynced.is_empty() && random.below(2) == 0 {
+            if !change.unsynced.is_empty() && random.bool() {
                 continue;
             }
             for (path, node) in &change.entries {
@@ -201,30 +201,17 @@ impl Disk {
 }
 
 impl Stored {
-    fn remainder(&self, random: &mut Random) -> Vec<u8> {
+    fn remainder(&self, random: &mut fastrand::Rng) -> Vec<u8> {
         let mut bytes = self.bytes.clone();
         if !self.is_synced {
-            let kept = random.below(bytes.len() as u64 + 1) as usize;
-            match random.below(3) {
+            let kept = random.usize(..=bytes.len());
+            match random.u8(..3) {
                 0 => bytes.truncate(kept),
                 1 => bytes[kept..].fill(0),
                 _ => {}
             }
         }
         bytes
-    }
-}
-
-/// SplitMix64.
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, bound: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut mixed = self.0;
-        mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (mixed ^ (mixed >> 31)) % bound
     }
 }
 

@@ -264,6 +264,16 @@ async fn a_conversation_blocked_by_unread_messages_ends_with_the_domain() {
     assert!(closed, "{ended}");
 }
 
+/// Sends the poses 0 to 9, and waits until the subscription is cancelled.
+async fn ten_poses(task: &mut Task) -> Result<Reply, DialogueError> {
+    task.agree("").await?;
+    for number in 0..10 {
+        task.inform(number.to_string()).await?;
+    }
+    task.cancelled().await?;
+    task.confirm_cancel().await
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_subscription_goes_on_until_it_is_cancelled() {
     let (rover, arm) = pair(&["monitor.check=enforce"]).await;
@@ -277,15 +287,7 @@ async fn a_subscription_goes_on_until_it_is_cancelled() {
     };
     let participant = async {
         let first = next_message(&arm).await.unwrap();
-        let handler = async |task: &mut Task| {
-            task.agree("").await?;
-            for number in 0..10 {
-                task.inform(number.to_string()).await?;
-            }
-            task.cancelled().await?;
-            task.confirm_cancel().await
-        };
-        respond(&arm, &first, handler).await.unwrap();
+        respond(&arm, &first, ten_poses).await.unwrap();
     };
     tokio::join!(initiator, participant);
 }
@@ -300,15 +302,7 @@ async fn a_dropped_subscription_is_cancelled_and_its_notifications_are_discarded
     };
     let participant = async {
         let first = next_message(&arm).await.unwrap();
-        let handler = async |task: &mut Task| {
-            task.agree("").await?;
-            for number in 0..10 {
-                task.inform(number.to_string()).await?;
-            }
-            task.cancelled().await?;
-            task.confirm_cancel().await
-        };
-        respond(&arm, &first, handler).await.unwrap();
+        respond(&arm, &first, ten_poses).await.unwrap();
         let hello = to(&arm, Performative::Inform, &rover, "hello");
         assert!(
             arm.send(hello.build().unwrap())

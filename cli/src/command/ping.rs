@@ -120,7 +120,7 @@ async fn ping(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
     let failed = tally.pings - tally.delivered();
     Failure::all((failed > 0).then(|| {
         let help = match stopped {
-            Some(stopped) => format!("{stopped}; {}", stopped.remedy()),
+            Some(stopped) => stopped.advice(),
             None => {
                 "`fipa routes` shows the route to the agent, and `fipa agents` whether it is known"
                     .to_owned()
@@ -140,7 +140,7 @@ async fn ping_all(agent: &Agent, arguments: &Arguments, tally: &mut Tally) -> Re
     starts.set_missed_tick_behavior(MissedTickBehavior::Delay);
     // The first ping fails only after the deadline.
     if let Some(stopped) = membership::stopped(agent, to.name()) {
-        report::warn(&format!("{stopped}; {}", stopped.remedy()));
+        report::warn(&stopped.advice());
     }
     let content = vec![b'.'; arguments.size];
     while arguments.count.is_none_or(|count| tally.pings < count) {

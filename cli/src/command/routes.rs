@@ -140,7 +140,7 @@ fn described(
     }
     text.push_str(&format!("{}\n", table.trim_fmt()));
     for agent in stopped {
-        text.push_str(&format!("\n{agent}; {}\n", agent.remedy()));
+        text.push_str(&format!("\n{}\n", agent.advice()));
     }
     match gateway {
         Some(gateway) => text.push_str(&gateway_described(gateway)),

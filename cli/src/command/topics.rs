@@ -336,7 +336,7 @@ fn subscribers(
             subscriber.waiting.to_string(),
         ]);
         if let Some(stopped) = stopped {
-            let _ = writeln!(reasons, "{stopped}; {}", stopped.remedy());
+            let _ = writeln!(reasons, "{}", stopped.advice());
         }
         if let Some(failure) = &subscriber.last_failure {
             let _ = writeln!(reasons, "{name}: last failure: {}", escape(failure));
@@ -388,7 +388,7 @@ fn failed(error: &TopicsError, agent: &AgentId, asking: &Agent, config: &Config)
     let as_stopped;
     let help = match error {
         _ if let Some(stopped) = membership::stopped(asking, agent.name()) => {
-            as_stopped = format!("{stopped}; {}", stopped.remedy());
+            as_stopped = stopped.advice();
             &as_stopped
         }
         TopicsError::Dialogue(DialogueError::NotDelivered { .. })

@@ -19,7 +19,7 @@ pub(crate) struct Open {
     pub(crate) words: Docking,
 }
 
-/// What a side waits for.
+/// The event for which a side waits.
 pub(crate) enum Event {
     /// A letter of the protocol.
     Letter(Box<Message>),

@@ -132,8 +132,8 @@ fn stopped(names: &[&str], agent: &Agent) -> Option<String> {
     let mut names = names.iter();
     let stopped = names.find_map(|name| membership::stopped(agent, name))?;
     Some(format!(
-        "{stopped}; {}. It may then take this message: if you send the message again, the receiver may get it twice",
-        stopped.remedy()
+        "{}. It may then take this message: if you send the message again, the receiver may get it twice",
+        stopped.advice()
     ))
 }
 
