@@ -19,6 +19,8 @@ use crate::actions::{ActionError, GoalError, OfferError};
 use crate::admin::contact::{AddressError, IntroduceError};
 #[cfg(feature = "secure")]
 use crate::admin::keys::KeysError;
+#[cfg(feature = "secure")]
+use crate::admin::pairing::{CodeError, PairingError};
 use crate::admin::routes::AskError;
 use crate::config::{ConfigError, RuleError};
 use crate::domain::coalition::CoalitionError;
@@ -190,6 +192,14 @@ pub enum Error {
     #[cfg(feature = "secure")]
     #[error(transparent)]
     Keys(#[from] KeysError),
+    /// Two hosts cannot be paired.
+    #[cfg(feature = "secure")]
+    #[error(transparent)]
+    Pairing(#[from] PairingError),
+    /// A text is no code for a pairing.
+    #[cfg(feature = "secure")]
+    #[error(transparent)]
+    Code(#[from] CodeError),
     /// The discovery of other hosts cannot start.
     #[cfg(feature = "mdns")]
     #[error(transparent)]

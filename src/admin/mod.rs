@@ -5,6 +5,8 @@ pub mod doctor;
 #[cfg(feature = "secure")]
 pub mod keys;
 pub mod open_files;
+#[cfg(feature = "secure")]
+pub mod pairing;
 pub mod reload;
 pub mod routes;
 pub mod stopped;

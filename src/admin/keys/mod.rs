@@ -329,25 +329,41 @@ impl Keys {
                 KeysError::NoCertificate
             });
         }
+        self.add(&certificates)?;
+        Ok(certificates)
+    }
+
+    /// Adds a certificate in DER to the trusted ones, and returns it.
+    ///
+    /// # Errors
+    /// If the certificate is invalid, was revoked or is this host's own.
+    pub(crate) fn trust_der(&self, der: &[u8]) -> Result<Certificate, KeysError> {
+        let certificate = Certificate::from_der(der.to_vec())?;
+        self.add(std::slice::from_ref(&certificate))?;
+        Ok(certificate)
+    }
+
+    /// Adds all of these certificates to the trusted ones, or none.
+    fn add(&self, certificates: &[Certificate]) -> Result<(), KeysError> {
         let own = self.own().ok();
         if certificates.iter().any(|it| Some(it) == own.as_ref()) {
             return Err(KeysError::Own);
         }
-        for certificate in &certificates {
+        for certificate in certificates {
             if self.file("revoked", certificate.fingerprint()).exists() {
                 return Err(KeysError::Revoked(certificate.fingerprint()));
             }
         }
         make_private(&self.dir)?;
         make_private(&self.dir.join("trusted"))?;
-        for certificate in &certificates {
+        for certificate in certificates {
             let file = self.file("trusted", certificate.fingerprint());
             if file.exists() {
                 continue;
             }
             write_new(&file, to_pem(certificate).as_bytes(), 0o644)?;
         }
-        Ok(certificates)
+        Ok(())
     }
 
     /// Reads the certificates of trusted peers, ordered by the names of their services.
