@@ -86,9 +86,10 @@
 //!
 //! The directory `examples` of the repository has a program per topic. [`watch`](admin::watch) observes the letters of
 //! all processes of a domain on this host, [`routes`](admin::routes) reports the routes that letters would take now,
-//! [`doctor`](admin::doctor) checks a machine, [`keys`](admin::keys) (feature `secure`) manages the keys of this host, and
-//! [`Gateway`] (feature `net`) is the gateway that `fipa up` runs. `docs/architecture.md` describes the
-//! other crates: delivery, transports and protocols.
+//! [`doctor`](admin::doctor) checks a machine, [`keys`](admin::keys) (feature `secure`) manages the keys of this host,
+//! [`pairing`](admin::pairing) (feature `secure`) exchanges certificates with another host, and [`Gateway`] (feature
+//! `net`) is the gateway that `fipa up` runs. `docs/architecture.md` describes the other crates: delivery, transports and
+//! protocols.
 //!
 #![cfg_attr(
     not(feature = "actions"),

@@ -4,9 +4,11 @@
 
 mod common;
 
+use std::io::Write as _;
+use std::net::{TcpListener, TcpStream};
 use std::process::Command;
 
-use common::{Host, Running};
+use common::{Host, Ran, Running};
 use fipa_testbed::{until, until_some};
 use serde_json::{Value, json};
 
@@ -39,6 +41,39 @@ impl KeyedHost {
         all.extend_from_slice(arguments);
         all.extend(["--dir", &dir, "--set", &name]);
         self.host.run(&all).done()
+    }
+
+    /// Starts `fipa keys pair`. Returns it with its port and its code.
+    fn pair(&self) -> (Running, String, String) {
+        let mut pairing = self.host.start(&["keys", "pair", "--dir", &self.dir()]);
+        let mut lines = vec![pairing.ready.clone()];
+        while !lines.iter().any(|line| line.starts_with("waiting ")) {
+            lines.push(pairing.line());
+        }
+        let after = |start: &str| {
+            let mut found = lines.iter().filter_map(|line| line.strip_prefix(start));
+            found.next().unwrap().to_owned()
+        };
+        let address = after("  fipa keys pair ");
+        let (_, port) = address.rsplit_once(':').unwrap();
+        let code = after("and type this code there: ");
+        (pairing, port.to_owned(), code)
+    }
+
+    /// Runs `fipa keys pair` with this address and this code.
+    fn pair_with(&self, address: &str, code: &str) -> Ran {
+        let pair = ["keys", "pair", address, "--dir", &self.dir()];
+        self.host
+            .run_with_input(&pair, format!("{code}\n").as_bytes())
+    }
+
+    /// The names of the gateways whose certificates are trusted.
+    fn trusted(&self) -> Vec<String> {
+        let list = self.list();
+        let names = list["trusted"].as_array().unwrap().iter();
+        names
+            .map(|it| it["mts"].as_str().unwrap().to_owned())
+            .collect()
     }
 
     fn list(&self) -> Value {
@@ -123,6 +158,110 @@ fn only_hosts_that_trust_each_other_exchange_letters() {
     until("the connection has ended again", || !rover.reaches(&arm));
     crex.keys(&["trust", &rover.certificate()]);
     until("the letter after that is delivered", || rover.reaches(&arm));
+}
+
+#[test]
+fn paired_hosts_exchange_letters() {
+    let rover = KeyedHost::new("rover", &[]);
+    let crex = KeyedHost::new("crex", &[]);
+    let (mut listening, port, code) = rover.pair();
+    // Another host that connects and is silent does not disturb the pairing.
+    let _silent = TcpStream::connect(format!("127.0.0.1:{port}")).unwrap();
+    let dialed = crex.pair_with(&format!("127.0.0.1:{port}"), &code).done();
+    assert_eq!(listening.end(), (Some(0), String::new()));
+    let listened: Vec<String> = std::iter::from_fn(|| listening.next_line()).collect();
+    let listened = listened.join("\n");
+    for (printed, trusted) in [(&dialed, &rover), (&listened, &crex)] {
+        let fingerprint = trusted.list()["own"]["fingerprint"].clone();
+        for part in [
+            "trusted ",
+            &trusted.name,
+            fingerprint.as_str().unwrap(),
+            "both hosts",
+        ] {
+            assert!(printed.contains(part), "{part}: {printed}");
+        }
+    }
+
+    let arm = format!("arm-{}", crex.host.domain);
+    let (_theirs, address) = crex.gateway(&[]);
+    let _arm = crex.host.echo(&arm);
+    let (_ours, _) = rover.gateway(&[(crex.name.as_str(), address.as_str())]);
+    until("a letter is delivered", || rover.reaches(&arm));
+}
+
+#[test]
+fn hosts_pair_over_ipv6_and_by_name() {
+    for address in ["[::1]", "localhost"] {
+        let (rover, crex) = (KeyedHost::new("rover", &[]), KeyedHost::new("crex", &[]));
+        let (mut listening, port, code) = rover.pair();
+        // Hyphens need not be typed.
+        let code = code.replace('-', "");
+        crex.pair_with(&format!("{address}:{port}"), &code).done();
+        assert_eq!(listening.end(), (Some(0), String::new()));
+        assert_eq!(rover.trusted(), std::slice::from_ref(&crex.name));
+        assert_eq!(crex.trusted(), [rover.name]);
+    }
+}
+
+#[test]
+fn a_wrong_code_ends_the_pairing_and_the_next_one_has_another() {
+    let (rover, crex) = (KeyedHost::new("rover", &[]), KeyedHost::new("crex", &[]));
+    let (mut listening, port, code) = rover.pair();
+    let address = format!("127.0.0.1:{port}");
+    // A text that is no code does not use up the attempt.
+    let errors = crex.pair_with(&address, "12345").failed(2);
+    assert!(errors.contains("a code has 9 digits"), "{errors}");
+
+    let (start, last) = code.split_at(code.len() - 1);
+    let wrong = format!("{start}{}", if last == "0" { "1" } else { "0" });
+    let dialed = crex.pair_with(&address, &wrong).failed(1);
+    let (ended, listened) = listening.end();
+    assert_eq!(ended, Some(1));
+    for errors in [dialed, listened] {
+        assert!(errors.contains("the code does not match"), "{errors}");
+        assert!(errors.contains("for a new code"), "{errors}");
+    }
+    let errors = crex.pair_with(&address, &code).failed(1);
+    assert!(errors.contains("cannot connect"), "{errors}");
+    assert!(rover.trusted().is_empty() && crex.trusted().is_empty());
+
+    let (_next, _, next) = rover.pair();
+    assert_ne!(next, code);
+}
+
+#[test]
+fn a_partner_that_ends_is_reported() {
+    let (rover, crex) = (KeyedHost::new("rover", &[]), KeyedHost::new("crex", &[]));
+    let closing = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = closing.local_addr().unwrap().to_string();
+    let ended = std::thread::spawn(move || drop(closing.accept().unwrap()));
+    let errors = crex.pair_with(&address, "123456789").failed(1);
+    ended.join().unwrap();
+    assert!(
+        errors.contains("the other host ended the pairing"),
+        "{errors}"
+    );
+
+    // The listening host waits for another one, and ends at Ctrl-C without an error.
+    let (listening, port, _) = rover.pair();
+    let mut stranger = TcpStream::connect(format!("127.0.0.1:{port}")).unwrap();
+    stranger.write_all(b"GET / HTTP/1.1\r\n").unwrap();
+    drop(stranger);
+    assert_eq!(listening.signal("-INT"), (None, String::new()));
+    let errors = crex
+        .pair_with(&format!("127.0.0.1:{port}"), "123456789")
+        .failed(1);
+    assert!(errors.contains("cannot connect"), "{errors}");
+}
+
+#[test]
+fn hosts_without_keys_are_told_to_make_them() {
+    let host = Host::new();
+    for pair in [&["keys", "pair"][..], &["keys", "pair", "127.0.0.1:1"]] {
+        let errors = host.run(pair).failed(1);
+        assert!(errors.contains("fipa keys init"), "{errors}");
+    }
 }
 
 #[test]

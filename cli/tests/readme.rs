@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::fs;
+use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -43,12 +44,7 @@ impl User<'_> {
     /// The command that runs this line in a shell on the host, in the home of the user.
     fn shell(&self, line: &str) -> Command {
         let programs = Path::new(env!("CARGO_BIN_EXE_fipa")).parent().unwrap();
-        let path = format!(
-            "{}:{}:{}",
-            fipa_testbed::directory().join("bin").display(),
-            programs.display(),
-            std::env::var("PATH").unwrap()
-        );
+        let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
         let mut command = self.host.command("unshare");
         let named = format!("echo {} >/proc/sys/kernel/hostname; {line}", self.name);
         command
@@ -66,10 +62,25 @@ impl User<'_> {
         let done = self.shell(line).stdout(Stdio::null()).status().unwrap();
         assert!(done.success(), "{}: {line}", self.name);
     }
+
+    /// Runs this line, and on the other host the command that it prints with the code that it prints.
+    fn pair(&self, line: &str, other: &User) {
+        let mut listening = self.shell(&format!("exec {line}"));
+        let mut listening = ChildGuard::start(listening.stdout(Stdio::piped()));
+        let output = BufReader::new(listening.child().stdout.take().unwrap());
+        let mut printed = output.lines().map(Result::unwrap);
+        let mut after = |start: &str| {
+            let found = printed.find_map(|line| line.strip_prefix(start).map(str::to_owned));
+            found.unwrap()
+        };
+        let (command, code) = (after("  "), after("and type this code there: "));
+        other.run(&format!("echo {code} | {command}"));
+        assert!(listening.wait().success());
+    }
 }
 
 #[test]
-fn two_hosts_are_secured_in_under_ten_commands() {
+fn two_hosts_are_secured_by_the_commands_of_the_readme() {
     isolated("inside_two_hosts_are_secured", &["unshare"]);
 }
 
@@ -77,17 +88,6 @@ fn two_hosts_are_secured_in_under_ten_commands() {
 #[ignore = "is run by the other test in namespaces of its own"]
 fn inside_two_hosts_are_secured() {
     enter();
-    // `scp` copies to the home of the other user.
-    let homes = fipa_testbed::directory();
-    let bin = homes.join("bin");
-    fs::create_dir(&bin).unwrap();
-    let copy = format!(
-        "exec cp \"$1\" \"{}/${{2%%:*}}/${{2#*:}}\"",
-        homes.display()
-    );
-    fs::write(bin.join("scp"), format!("#!/bin/sh\n{copy}\n")).unwrap();
-    fipa_testbed::run(&format!("chmod +x {}", bin.join("scp").display()));
-
     let network = Network::new(2);
     let users = ["rover", "crex"].map(|name| {
         let number = usize::from(name == "crex");
@@ -96,16 +96,9 @@ fn inside_two_hosts_are_secured() {
     });
     let [rover, crex] = &users;
     let lines = commands("Two hosts trust each other");
-    // The same lines for the other host.
-    let swapped: Vec<String> = lines
-        .iter()
-        .map(|line| {
-            line.replace("crex", "X")
-                .replace("rover", "crex")
-                .replace('X', "rover")
-        })
-        .collect();
-    assert!(lines.len() + swapped.len() < 10, "{lines:?}");
+    let [init, pair, up] = lines[..] else {
+        panic!("{lines:?}");
+    };
     let configuration = configuration("Two hosts trust each other");
     for user in &users {
         let directory = user.home().join(".config/fipa");
@@ -115,14 +108,10 @@ fn inside_two_hosts_are_secured() {
         assert_ne!(text, configuration);
         fs::write(directory.join("fipa.toml"), text).unwrap();
     }
-    let (last, before) = lines.split_last().unwrap();
-    for (ours, theirs) in before.iter().zip(&swapped) {
-        rover.run(ours);
-        crex.run(theirs);
-    }
-    let gateways = [(rover, *last), (crex, swapped[before.len()].as_str())];
-    let _gateways = gateways
-        .map(|(user, line)| ChildGuard::until_ready(&mut user.shell(&format!("exec {line}"))));
+    users.iter().for_each(|user| user.run(init));
+    rover.pair(pair, crex);
+    let _gateways =
+        [rover, crex].map(|user| ChildGuard::until_ready(&mut user.shell(&format!("exec {up}"))));
     let _arm = ChildGuard::until_ready(&mut crex.shell("exec fipa echo arm_1"));
     let begun = Instant::now();
     loop {

@@ -1,12 +1,14 @@
 //! `fipa keys`: the keys of this host and the certificates that it trusts.
 
-use std::io::{self, IsTerminal};
+use std::io::{self, BufRead as _, IsTerminal, Read as _};
 use std::path::{self, Path, PathBuf};
+use std::slice;
 use std::time::{Duration, SystemTime};
 
 use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, Subcommand};
 use fipa::admin::keys::{Certificate, Holding, Keys, KeysError, VALID, Whose};
+use fipa::admin::pairing::{self, Code, CodeError, Listener, OPEN, Paired, PairingError};
 use fipa::error::ErrorChain;
 use fipa_acl::escape;
 use serde_json::{Value, json};
@@ -24,9 +26,9 @@ use crate::{input, output};
 /// A running gateway applies changes within two seconds.
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Examples, on the host of rover-mts (on the host of crex-mts with rover.pem):
-  fipa keys init                           once; prints the path of the certificate
-  fipa keys trust crex.pem                 crex.pem is the file own.pem of the other host
+Examples:
+  fipa keys init                           once on each host
+  fipa keys pair                           on one host; prints the command for the other host, and a code
   fipa up --set security.keys=$HOME/.config/fipa/keys --set 'transport.tcp.listen=*:7788'")]
 pub(crate) struct Arguments {
     /// Directory of the keys [default: security.keys, else ~/.config/fipa/keys]
@@ -55,6 +57,28 @@ Examples:
         /// Validity of the certificate, for example 90days [default: ten years]
         #[arg(long, value_name = "DURATION", value_parser = options::duration)]
         valid: Option<Duration>,
+    },
+
+    /// Make this host and another one trust each other, by a code
+    ///
+    /// On one host, the command without HOST:PORT opens a port for five minutes. It prints the command for the other
+    /// host, and a code that the other command asks for. Only a person who sees this code can pair a host. A wrong
+    /// code ends the pairing on both hosts; the next one has a new code.
+    ///
+    /// Elsewhere than on a terminal, the code is read from standard input.
+    #[command(after_help = "\
+Examples:
+  fipa keys pair                           on the first host
+  fipa keys pair 192.168.1.7:43521         on the second host; the first one prints this line
+  fipa keys pair --port 7789               on a port that the firewall lets through
+  ssh crex fipa keys pair 192.168.1.7:43521        prompts for the code, too")]
+    Pair {
+        /// Address and port that the other host prints
+        #[arg(value_name = "HOST:PORT", conflicts_with = "port", value_parser = NonEmptyStringValueParser::new())]
+        address: Option<String>,
+        /// Port to open [default: one that the system chooses]
+        #[arg(long, value_name = "PORT", value_parser = clap::value_parser!(u16).range(1..))]
+        port: Option<u16>,
     },
 
     /// Trust the certificates in a file
@@ -135,6 +159,12 @@ Examples:
 /// Number of digits that identify a certificate in a warning.
 const SHOWN_DIGITS: usize = 16;
 
+/// Maximum number of addresses of this host that are shown.
+const SHOWN_ADDRESSES: usize = 4;
+
+/// Maximum length of the line with a code, in bytes.
+const MAX_LINE: u64 = 256;
+
 /// Maximum size of a file with certificates, in bytes.
 const MAX_PEM: u64 = 1 << 20;
 
@@ -151,7 +181,8 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             let certificate = certificate.map_err(|error| failed(&error, &keys))?;
             output::text(&format!(
                 "created a key and a certificate for {}\n{}\
-                 give {} to the owners of other hosts, and add to the configuration:\n\n\
+                 to pair it with another host, run `fipa keys pair`, or give {} to the owner of that host\n\
+                 add to the configuration:\n\n\
                  [security]\nkeys = {:?}\n",
                 escape(certificate.certified().mts()),
                 described(&certificate),
@@ -164,6 +195,10 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                     .to_string(),
             ))
         }
+        Action::Pair { address, port } => match address {
+            Some(address) => pair_with(&address, &keys),
+            None => wait_for_pair(port.unwrap_or(0), &keys),
+        },
         Action::Trust { file } => {
             let pem = input::read(&file, MAX_PEM)?;
             let trusted = keys.trust(&pem).map_err(|error| match error {
@@ -177,27 +212,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 ),
                 other => failed(&other, &keys),
             })?;
-            let mut text = String::new();
-            for certificate in &trusted {
-                text.push_str(&format!(
-                    "trusted {}\n",
-                    escape(certificate.certified().mts())
-                ));
-                text.push_str(&described(certificate));
-                text.push_str(&validity_note(certificate, Whose::Peer));
-            }
-            let all = keys.trusted().map_err(|error| failed(&error, &keys))?;
-            for certificate in &trusted {
-                text.push_str(&also_trusted(certificate, &all));
-            }
-            output::text(&text)?;
-            // This host may have no keys yet.
-            if let Ok(own) = keys.own() {
-                trusted
-                    .iter()
-                    .for_each(|certificate| warn_of_own_name(certificate, &own));
-            }
-            Ok(())
+            show_trusted(&trusted, &keys)
         }
         Action::List { json } => list(&keys, json).map_err(|error| failed(&error, &keys))?,
         Action::Distrust { which } => {
@@ -232,6 +247,135 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             output::text(&format!("{done}\n{}", described(&renewed)))
         }
     }
+}
+
+/// Shows the certificates that were just trusted, with what is unusual about them.
+fn show_trusted(trusted: &[Certificate], keys: &Keys) -> Result<(), Failure> {
+    let mut text = String::new();
+    for certificate in trusted {
+        text.push_str(&format!(
+            "trusted {}\n",
+            escape(certificate.certified().mts())
+        ));
+        text.push_str(&described(certificate));
+        text.push_str(&validity_note(certificate, Whose::Peer));
+    }
+    let all = keys.trusted().map_err(|error| failed(&error, keys))?;
+    for certificate in trusted {
+        text.push_str(&also_trusted(certificate, &all));
+    }
+    output::text(&text)?;
+    // This host may have no keys yet.
+    if let Ok(own) = keys.own() {
+        trusted
+            .iter()
+            .for_each(|certificate| warn_of_own_name(certificate, &own));
+    }
+    Ok(())
+}
+
+/// Shows a code, and waits for the host on which it is typed.
+fn wait_for_pair(port: u16, keys: &Keys) -> Result<(), Failure> {
+    let place = "this pairing";
+    let failed = |error| not_paired(&error, place, keys);
+    let paired = options::block_on(async {
+        let listener = Listener::open(keys, port).map_err(failed)?;
+        output::text(&invitation(&listener))?;
+        listener.pair().await.map_err(failed)
+    })??;
+    finish_pair(&paired, keys)
+}
+
+/// Tells what to type on the other host.
+fn invitation(listener: &Listener) -> String {
+    let commands: Vec<_> = match listener.addresses() {
+        Ok(addresses) => addresses
+            .iter()
+            .take(SHOWN_ADDRESSES)
+            .map(|address| format!("  fipa keys pair {address}\n"))
+            .collect(),
+        Err(error) => {
+            report::warn(&ErrorChain(&error).to_string());
+            vec![format!("  fipa keys pair HOST:{}\n", listener.port())]
+        }
+    };
+    format!(
+        "on the other host, run{}\n{}and type this code there: {}\nwaiting {}, for one attempt\n",
+        match commands.len() {
+            1 => "",
+            _ => " the first of these that connects",
+        },
+        commands.concat(),
+        listener.code(),
+        humantime::format_duration(OPEN),
+    )
+}
+
+/// Asks for the code of the host at this address, and pairs with it.
+fn pair_with(place: &str, keys: &Keys) -> Result<(), Failure> {
+    // A code that is typed is good for one attempt: what is missing here must not cost it.
+    keys.own().map_err(|error| failed(&error, keys))?;
+    if io::stdin().is_terminal() {
+        output::text("code that the other host shows: ")?;
+    }
+    let code = read_code().map_err(|problem| {
+        Failure::wrong_usage(
+            problem,
+            "standard input",
+            "type the code that `fipa keys pair` shows on the other host",
+        )
+    })?;
+    let paired = options::block_on(pairing::dial(keys, place, &code))?;
+    let paired = paired.map_err(|error| not_paired(&error, place, keys))?;
+    finish_pair(&paired, keys)
+}
+
+/// Reads a line with a code.
+fn read_code() -> Result<Code, String> {
+    let mut line = String::new();
+    let read = io::stdin().lock().take(MAX_LINE).read_line(&mut line);
+    read.map_err(|error| error.to_string())?;
+    line.parse().map_err(|error: CodeError| error.to_string())
+}
+
+fn finish_pair(paired: &Paired, keys: &Keys) -> Result<(), Failure> {
+    show_trusted(slice::from_ref(&paired.certificate), keys)?;
+    if paired.mutual {
+        return output::text(
+            "both hosts trust each other; running gateways apply it within two seconds\n",
+        );
+    }
+    Err(Failure::failed(
+        "the other host did not say that it trusts this one",
+        keys.dir().display().to_string(),
+        format!(
+            "see what it prints; `fipa keys distrust {}` ends the trust of this host, too",
+            start(&paired.certificate)
+        ),
+    ))
+}
+
+fn not_paired(error: &PairingError, place: &str, keys: &Keys) -> Failure {
+    let help = match error {
+        PairingError::Keys(error) => return failed(error, keys),
+        PairingError::Listen { .. } => "choose another port with --port, or none",
+        PairingError::Address { .. } => {
+            "give the address and the port that `fipa keys pair` prints on the other host"
+        }
+        PairingError::Connect { .. } => {
+            "check that `fipa keys pair` still waits on the other host, at this address; if a firewall is in the way, \
+             choose a port that it lets through (`fipa keys pair --port` there)"
+        }
+        PairingError::NotPairing => {
+            "check the address, and run the same version of fipa on both hosts"
+        }
+        PairingError::WrongCode => {
+            "no host was trusted; start again with `fipa keys pair` on the first host, for a new code. If the code was \
+             typed correctly, another host on the network tried to guess it"
+        }
+        _ => "start again with `fipa keys pair` on the first host, for a new code",
+    };
+    Failure::failed(ErrorChain(error).to_string(), escape(place), help)
 }
 
 /// The beginning of a fingerprint, which identifies a certificate on the command line.

@@ -1,9 +1,9 @@
 //! Two hosts trust each other after a code, which one of them shows, was typed on the other.
 //!
 //! The listening host makes a code and opens a port ([`Listener`]). The dialing host connects and gets the same code
-//! from its user ([`dial`]). Both agree on a key by SPAKE2 (RFC 9382, with the group and the hashes of the crate
-//! `spake2`): a host that guesses the code can test one guess, and a host that listens can test none. After each
-//! has proved that it has the key, they send each other their certificates, authenticated by the key.
+//! from its user ([`dial`]). Both agree on a key by SPAKE2 (in the form of the crate `spake2`, which is older
+//! than RFC 9382): a host that guesses the code can test one guess, and one that only reads the messages can test none.
+//! After each has proved that it has the key, they send each other their certificates, authenticated by the key.
 //!
 //! The wrong proof of one host ends the pairing, and the next one has another code. Connections that prove nothing do
 //! not end it.
@@ -40,6 +40,10 @@ pub const OPEN: Duration = Duration::from_secs(5 * 60);
 
 /// Time for the messages up to the confirmation of the dialing host, and for those after it.
 const ANSWER: Duration = Duration::from_secs(10);
+
+/// Time from a hello to the answer, which hides the time of the computation: the crate `spake2` does not promise that it
+/// takes equally long for each code.
+const COMPUTATION: Duration = Duration::from_millis(20);
 
 /// Maximum number of connections of unknown hosts at one time. A further one replaces the oldest one.
 const MAX_CONNECTIONS: usize = 16;
@@ -241,10 +245,14 @@ async fn listen_to<S: AsyncRead + AsyncWrite + Unpin>(
     code: Code,
 ) -> Result<(S, Unconfirmed, [u8; TAG]), PairingError> {
     let theirs: [u8; HELLO] = read(&mut stream).await?;
+    let answer = Instant::now() + COMPUTATION;
     let greeting = Greeting::new(Role::Listening, &code, OsRng);
     let ours = *greeting.hello();
-    let unconfirmed = greeting.greeted(&theirs)?;
+    let unconfirmed = greeting.greeted(&theirs);
+    sleep_until(answer).await;
+    // Also a host of another version gets the hello, to tell its user.
     write(&mut stream, &ours).await?;
+    let unconfirmed = unconfirmed?;
     let confirmation = read(&mut stream).await?;
     Ok((stream, unconfirmed, confirmation))
 }

@@ -436,6 +436,19 @@ async fn silent_connections_and_other_protocols_do_not_disturb_a_pairing() {
     assert!(matches!(again, Err(PairingError::Connect { .. })));
 }
 
+/// The dialing host learns that the versions differ.
+#[tokio::test]
+async fn a_host_of_another_version_gets_a_hello() {
+    let (near, mut far) = pipe();
+    let mut hello = *greeting(Role::Dialing, "123-456-789", 1).hello();
+    hello[13] = b'2';
+    far.write_all(&hello).await.unwrap();
+    let listened = listen_to(near, code("123-456-789")).await;
+    assert!(matches!(listened, Err(PairingError::NotPairing)));
+    let ours: [u8; HELLO] = read(&mut far).await.unwrap();
+    assert!(ours.starts_with(b"fipa pairing 1"));
+}
+
 #[tokio::test]
 async fn a_wrong_code_ends_the_pairing_on_both_hosts() {
     let (rover, crex) = (keyed("rover-mts"), keyed("crex-mts"));
