@@ -71,7 +71,7 @@ Examples:
   fipa keys pair                           on the first host
   fipa keys pair 192.168.1.7:43521         on the second host; the first one prints this line
   fipa keys pair --port 7789               on a port that the firewall lets through
-  ssh crex fipa keys pair 192.168.1.7:43521        prompts for the code, too")]
+  ssh -t crex fipa keys pair 192.168.1.7:43521     the same from the first host, in another terminal")]
     Pair {
         /// Address and port that the other host prints
         #[arg(value_name = "HOST:PORT", conflicts_with = "port", value_parser = NonEmptyStringValueParser::new())]

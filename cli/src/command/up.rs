@@ -157,7 +157,7 @@ fn trusted_hosts(config: &Config) -> String {
     };
     let names: Vec<_> = trusted.iter().map(name).collect();
     match names.as_slice() {
-        [] => "none: no certificate is trusted yet (`fipa keys trust FILE`)".to_owned(),
+        [] => "none: no certificate is trusted yet (`fipa keys pair`)".to_owned(),
         names => format!("encrypted, with the certificates of {}", names.join(", ")),
     }
 }

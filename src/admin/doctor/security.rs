@@ -59,7 +59,7 @@ fn keys(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
         }
     };
     if credentials.trusted.is_empty() {
-        let advice = "trust the certificates of the other hosts: `fipa keys trust FILE`";
+        let advice = "pair this host with the other ones: `fipa keys pair`";
         let found = "no other host is trusted, so every connection from another host is refused";
         checks.push(AREA.problem(KEYS, Severity::Warning, found, advice));
     }
