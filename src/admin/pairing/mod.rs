@@ -41,8 +41,8 @@ pub const OPEN: Duration = Duration::from_secs(5 * 60);
 /// Time for the messages up to the confirmation of the dialing host, and for those after it.
 const ANSWER: Duration = Duration::from_secs(10);
 
-/// Time from a hello to the answer, which hides the time of the computation: the crate `spake2` does not promise that it
-/// takes equally long for each code.
+/// Time from a hello to the answer, which hides the time of the computation: the crate `spake2` does not promise that
+/// it takes equally long for each code.
 const COMPUTATION: Duration = Duration::from_millis(20);
 
 /// Maximum number of connections of unknown hosts at one time. A further one replaces the oldest one.
