@@ -260,6 +260,7 @@ async fn a_process_that_publishes_agents_of_other_hosts() {
     let run = std::env::var_os("FIPA_RUNTIME_DIR").unwrap();
     let gateway = HostDirectory::open(HostConfig {
         brief: false,
+        users: fipa_transport::DomainUsers::This,
         dir: std::path::Path::new(&run).join(&name).join("directory"),
         mts: MtsId::new("gateway", Incarnation::random()),
         gateway: true,

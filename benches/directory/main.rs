@@ -100,6 +100,7 @@ fn on_one_host(criterion: &mut Criterion) {
     let [other, own] = ["other", "own"].map(|mts| {
         let config = HostConfig {
             brief: false,
+            users: fipa_transport::DomainUsers::This,
             dir: place.path().join("run"),
             mts: MtsId::new(mts, Incarnation::random()),
             gateway: false,

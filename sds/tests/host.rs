@@ -19,11 +19,12 @@ use fipa_sds::{
     RegisterError, Role, Source,
 };
 use fipa_testbed::{ChildGuard, until_some_async};
-use fipa_transport::Incarnation;
+use fipa_transport::{DomainUsers, Incarnation};
 
 fn config(dir: &Path) -> HostConfig {
     HostConfig {
         brief: false,
+        users: DomainUsers::This,
         dir: dir.to_owned(),
         mts: MtsId::new("mts", Incarnation::random()),
         gateway: false,
@@ -1143,5 +1144,8 @@ async fn of_several_agents_with_one_incarnation_the_last_one_published_has_it() 
     for name in ["a", "b", "c"] {
         assert_eq!(&*directory.known(name).unwrap().name, name);
     }
-    assert_eq!(HostDirectory::peek(&dir).unwrap().len(), 3);
+    assert_eq!(
+        HostDirectory::peek(&dir, DomainUsers::This).unwrap().len(),
+        3
+    );
 }

@@ -54,6 +54,7 @@ async fn they_are_refused_at_registration() {
     let home = tempfile::tempdir().unwrap();
     let config = HostConfig {
         brief: false,
+        users: fipa_transport::DomainUsers::This,
         dir: home.path().join("domain"),
         mts: MtsId::new("mts", MTS),
         gateway: false,

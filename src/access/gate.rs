@@ -278,6 +278,7 @@ mod tests {
         let open = |gateway| {
             let directory = HostDirectory::open(HostConfig {
                 brief: false,
+                users: fipa_transport::DomainUsers::This,
                 dir: place.path().join("domain"),
                 mts: MtsId::new("mts", Incarnation::random()),
                 gateway,

@@ -13,7 +13,7 @@ use fipa_acl::ErrorChain;
 use fipa_mts::watch::Record;
 use fipa_mts::watch::record::{MAX_LEN, RecordBody};
 use fipa_sds::{Cancellation, Directory, HostDirectory, Reach};
-use fipa_transport::{Incarnation, log_limit};
+use fipa_transport::{DomainUsers, Incarnation, log_limit};
 use serde::Serialize;
 use tokio::net::{UnixDatagram, UnixListener, UnixStream};
 use tokio::sync::mpsc;
@@ -100,7 +100,7 @@ async fn collect(host: &HostDirectory, socket: UnixListener) -> Vec<ReloadedProc
     let due = Instant::now() + ANSWER_TIMEOUT;
     let (sender, mut progress) = mpsc::channel(MAX_PROCESSES);
     let mut accepting = JoinSet::new();
-    accepting.spawn(accept(socket, sender));
+    accepting.spawn(accept(socket, host.users(), sender));
     let mut asked: BTreeMap<Incarnation, ReloadedProcess> = BTreeMap::new();
     let mut silent: HashSet<Incarnation> = HashSet::new();
     loop {
@@ -155,20 +155,24 @@ fn has_all(host: &HostDirectory, asked: &BTreeMap<Incarnation, ReloadedProcess>)
 }
 
 /// Accepts processes and asks them, until it is aborted.
-async fn accept(listener: UnixListener, progress: mpsc::Sender<Progress>) {
+async fn accept(listener: UnixListener, users: DomainUsers, progress: mpsc::Sender<Progress>) {
     let mut processes = JoinSet::new();
     while let Ok((process, _)) = listener.accept().await {
         if processes.len() < MAX_PROCESSES {
-            processes.spawn(ask(process, progress.clone()));
+            processes.spawn(ask(process, users, progress.clone()));
         }
     }
 }
 
 /// Asks one process, and reports its answer.
-async fn ask(process: UnixStream, progress: mpsc::Sender<Progress>) -> Option<()> {
-    // The directory is private, but answers must be from processes of this user in any case.
+async fn ask(
+    process: UnixStream,
+    users: DomainUsers,
+    progress: mpsc::Sender<Progress>,
+) -> Option<()> {
+    // The directory is private, but answers must be from users of the domain in any case.
     let peer = process.peer_cred().ok()?;
-    if peer.uid() != rustix::process::geteuid().as_raw() {
+    if !users.admit(peer.uid()) {
         return None;
     }
     let process = socket::accepted(process).ok()?;

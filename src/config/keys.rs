@@ -122,6 +122,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::Text(config.runtime_dir.clone()),
     },
     Key {
+        path: &["group"],
+        shape: Shape::Text,
+        expected: r#"a group of this host such as "robot", or its number in quotes"#,
+        write: |config, value| text(value).map(|group| config.group = group),
+        read: |config| Value::Text(config.group.clone()),
+    },
+    Key {
         path: &["mts", "name"],
         shape: Shape::Text,
         expected: "a name of 1 to 255 bytes",

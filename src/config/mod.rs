@@ -12,6 +12,7 @@
 //! ```toml
 //! domain = "default"                  # processes of one domain on one host find each other
 //! runtime_dir = ""                    # directory in which the processes meet; empty: /tmp/fipa-<user id>
+//! group = ""                          # group whose members share the domain; empty: it belongs to one user
 //! [mts]
 //! name = "sherpa-mts"                 # default: <host name>-mts
 //! transports = ["shm", "unix", "tcp"] # in order of preference; others are off
@@ -114,6 +115,9 @@ pub struct Config {
     /// `runtime_dir`: the directory with a directory for each domain, in which its processes meet;
     /// `/tmp/fipa-<user id>` if it is empty. `$FIPA_RUNTIME_DIR` precedes it.
     pub runtime_dir: String,
+    /// `group`: the group of this host whose members share the domain, by its name in `/etc/group` or by its number.
+    /// If it is empty, the domain belongs to one user. Needs a directory that the members can enter (`runtime_dir`).
+    pub group: String,
     /// `[mts]`: the message transport service of this process.
     pub mts: MtsConfig,
     /// `[routes]`: the orders of transports for particular receivers. The first match counts; entries
@@ -473,6 +477,7 @@ impl Config {
         Self {
             domain: "default".to_owned(),
             runtime_dir: String::new(),
+            group: String::new(),
             mts: MtsConfig {
                 name: keys::default_mts_name(host_name),
                 transports: vec![Kind::Shm, Kind::Unix, Kind::Tcp],

@@ -1,30 +1,37 @@
-//! The private directory that the processes of a domain share on one host.
+//! The directory that the processes of a domain share on one host.
 //!
 //! Its path is `$FIPA_RUNTIME_DIR/<domain>`, or `<runtime_dir>/<domain>` with the key of the configuration, or
 //! `/tmp/fipa-<uid>/<domain>`, which is the same for a login shell and a service of the same user. Both levels belong
-//! to the user and have mode 0700. The last process that leaves removes the lower level. The upper level stays: a configured one
-//! belongs to its owner, and in `/tmp` another user could take the name (see `user_dir`).
+//! to the user and have mode 0700. With a `group`, both belong to the group and have mode 0770. The last process that
+//! leaves removes the lower level. The upper level stays: a configured one belongs to its owner, and in `/tmp` another
+//! user could take the name (see `user_dir`).
+//!
+//! A member of the group can replace each name in the directory. So files are used relative to a descriptor that was
+//! examined, or belong to this user, or are read as claims. Shared memory is below `/dev/shm/fipa-<uid>` instead, where
+//! only this user can replace a name.
 //!
 //! Cleaners of `/tmp` remove old files. Every process holds a shared lock on both levels, which
 //! systemd-tmpfiles respects, and renews the timestamps once a day for other cleaners.
 
 use std::ffi::{OsStr, OsString};
-use std::fs::{self, DirBuilder};
+use std::fs;
 use std::io;
-use std::io::Write as _;
+use std::io::{Read as _, Write as _};
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use bytesize::ByteSize;
-use fipa_transport::{fnv1a, log_limit};
+use fipa_acl::escape;
+use fipa_transport::{DirectoryError, DomainUsers, Intrusion, fnv1a, log_limit};
 use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
 use crate::Config;
-use crate::domain::user_dir::{Holder, UserDir, user_name};
+use crate::domain::accounts::{group_name, group_number, is_member, user_name};
+use crate::domain::user_dir::{Holder, UserDir};
 
 /// The environment variable with the directory of all domains, instead of that in `/tmp`.
 pub(crate) const VARIABLE: &str = "FIPA_RUNTIME_DIR";
@@ -58,10 +65,16 @@ const PROBE: usize = 16 << 10;
 /// Maximum length of a host identifier, in bytes.
 const MAX_HOST: usize = 128;
 
-/// The private directory of a domain.
+/// The directory of a domain.
 #[derive(Debug, Clone)]
 pub(crate) struct DomainDir {
     base: PathBuf,
+    /// The key `group`; empty if the domain belongs to one user.
+    group: String,
+    /// The users of the domain. `None` if the group does not exist.
+    users: Option<DomainUsers>,
+    /// Whether the user has named the directory.
+    is_named: bool,
     /// The holder of the name `/tmp/fipa-<uid>`, if the base has another name.
     name_held_by: Option<Holder>,
     domain: String,
@@ -102,6 +115,16 @@ pub enum DomainDirError {
         /// The error of the operating system.
         source: io::Error,
     },
+    /// The group of the configuration does not exist, or has no directory.
+    #[error("cannot share a domain with the group {group:?}: {problem}; {remedy}")]
+    Group {
+        /// The group of the configuration.
+        group: String,
+        /// The violated requirement.
+        problem: &'static str,
+        /// The remedy.
+        remedy: String,
+    },
     /// Other users could read or change the contents of the directory.
     #[error("{} cannot be used: {problem}; {remedy}", path.display())]
     NotPrivate {
@@ -123,12 +146,11 @@ impl DomainDir {
     /// Creates the directory of a domain, and checks that it is private.
     pub(crate) fn prepare(config: &Config) -> Result<Self, DomainDirError> {
         let mut dir = Self::of(config);
-        if make_private(&dir.base).is_err() {
+        if dir.create().is_err() {
             // Another user may have taken the name in between.
             dir = Self::of(config);
-            make_private(&dir.base)?;
+            dir.create()?;
         }
-        make_private(&dir.path())?;
         if let Some(holder) = dir.name_held_by {
             log_limit::warn!(
                 "{holder} holds the name of the directory in which the domains of this user are, so they are \
@@ -144,6 +166,7 @@ impl DomainDir {
         let variable = std::env::var_os(VARIABLE);
         let named = [variable, Some(OsString::from(&config.runtime_dir))];
         let named = named.into_iter().flatten().find(|it| !it.is_empty());
+        let is_named = named.is_some();
         let (base, name_held_by) = match named {
             // A relative path would name another directory in each working directory.
             Some(base) => {
@@ -158,10 +181,87 @@ impl DomainDir {
         };
         Self {
             base,
+            group: config.group.clone(),
+            users: match config.group.is_empty() {
+                true => Some(DomainUsers::This),
+                false => group_number(&config.group).map(DomainUsers::Group),
+            },
+            is_named,
             name_held_by,
             domain: config.domain.clone(),
             locks: None,
         }
+    }
+
+    /// Returns the users of the domain.
+    ///
+    /// # Errors
+    /// If the configuration names a group that does not exist, or no directory that its members can enter.
+    pub(crate) fn users(&self) -> Result<DomainUsers, DomainDirError> {
+        let wrong = |problem, remedy| DomainDirError::Group {
+            group: self.group.clone(),
+            problem,
+            remedy,
+        };
+        let group = escape(&self.group);
+        let users = self.users.ok_or_else(|| {
+            wrong(
+                "/etc/group does not list it",
+                format!("create it (`addgroup --system {group}`), or write its number"),
+            )
+        })?;
+        if matches!(users, DomainUsers::Group(_)) && !self.is_named {
+            return Err(wrong(
+                "no directory is configured that its members can enter",
+                format!(
+                    "set runtime_dir = \"/run/fipa\", and create the directory: `install -d -g {group} -m 770 \
+                     /run/fipa`"
+                ),
+            ));
+        }
+        Ok(users)
+    }
+
+    /// Creates both levels if they are missing, and checks that only the users of the domain can enter them.
+    fn create(&self) -> Result<(), DomainDirError> {
+        let users = self.users()?;
+        for path in self.levels() {
+            let created = users.create_directory(&path);
+            drop(created.map_err(|error| self.unusable(error))?);
+            users.open_to_group(&path).map_err(io_error(&path))?;
+        }
+        self.create_memory_of_user();
+        self.check_owner(users)
+    }
+
+    /// Checks that only the users of the domain can enter a level.
+    fn check(&self, path: &Path) -> Result<OwnedFd, DomainDirError> {
+        let opened = self.users()?.open_directory(path);
+        opened.map_err(|error| self.unusable(error))
+    }
+
+    /// Checks that the upper level belongs to a member of the group, or to root. Otherwise its owner could open it to
+    /// other users: files in a directory with the set-group-ID bit have its group, whoever creates them.
+    fn check_owner(&self, users: DomainUsers) -> Result<(), DomainDirError> {
+        let DomainUsers::Group(group) = users else {
+            return Ok(());
+        };
+        let path = &self.base;
+        let owner = fs::symlink_metadata(path).map_err(io_error(path))?.uid();
+        let is_this = owner == rustix::process::geteuid().as_raw();
+        if owner == 0 || is_this || is_member(owner, group) {
+            return Ok(());
+        }
+        let at = path.display();
+        Err(DomainDirError::NotPrivate {
+            path: path.clone(),
+            problem: format!(
+                "it belongs to {}, which is not a member of {} (/etc/group)",
+                user_name(owner),
+                group_name(group)
+            ),
+            remedy: format!("give it to root: `chown root {at}`"),
+        })
     }
 
     /// Returns the holder of the name `/tmp/fipa-<uid>`, if the directory has another name.
@@ -173,8 +273,8 @@ impl DomainDir {
     /// created files in the directory, so that no other process removes the levels as empty.
     pub(crate) fn lock(&mut self) -> Result<(), DomainDirError> {
         let locks = DirLocks {
-            base: lock_shared(&self.base)?,
-            domain: lock_shared(&self.path())?,
+            base: self.lock_shared(&self.base)?,
+            domain: self.lock_shared(&self.path())?,
             host: self.host_id().ok(),
         };
         self.locks = Some(Arc::new(locks));
@@ -195,11 +295,11 @@ impl DomainDir {
 
     /// Creates and locks the levels again after another program removed them.
     pub(crate) fn rejoin(&mut self) -> Result<(), DomainDirError> {
+        self.create_memory_of_user();
         if self.is_there() {
             return Ok(());
         }
-        make_private(&self.base)?;
-        make_private(&self.path())?;
+        self.create()?;
         let host = self.locks.as_ref().and_then(|locks| locks.host.clone());
         if let Some(host) = &host {
             // Processes that start from now on must get the same host identifier.
@@ -212,10 +312,10 @@ impl DomainDir {
     }
 
     fn write_host(&self, host: &str) -> io::Result<()> {
-        let mut options = fs::File::options();
-        options.write(true).create_new(true).mode(0o600);
-        match options.open(self.path().join(HOST)) {
-            Ok(mut file) => file.write_all(host.as_bytes()),
+        let users = self.users().map_err(io::Error::other)?;
+        let directory = self.check(&self.path()).map_err(io::Error::other)?;
+        match users.create_file(directory, HOST) {
+            Ok(file) => fs::File::from(file).write_all(host.as_bytes()),
             // Another process of the domain has written it.
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
             Err(error) => Err(error),
@@ -241,8 +341,8 @@ impl DomainDir {
     /// Checks that the existing levels are private. Returns whether both exist.
     pub(crate) fn exists(&self) -> Result<bool, DomainDirError> {
         for path in [&self.base, &self.path()] {
-            match check_private(path) {
-                Ok(()) => {}
+            match self.check(path) {
+                Ok(_) => {}
                 Err(DomainDirError::Io { source, .. })
                     if source.kind() == io::ErrorKind::NotFound =>
                 {
@@ -251,6 +351,7 @@ impl DomainDir {
                 Err(error) => return Err(error),
             }
         }
+        self.check_owner(self.users()?)?;
         Ok(true)
     }
 
@@ -268,7 +369,7 @@ impl DomainDir {
                 Ok(()) => {}
                 // The first process of the domain creates it.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-                Err(error) => return Err(not_writable(path, error)),
+                Err(error) => return Err(self.not_writable(path, error)),
             }
         }
         Ok(())
@@ -285,22 +386,45 @@ impl DomainDir {
         self.base.join(&self.domain)
     }
 
-    /// Returns the path of a subdirectory, for example `directory`, `shm` or `unix`.
+    /// Returns the directory of this user's shared memory.
+    pub(crate) fn memory(&self) -> PathBuf {
+        match self.group.is_empty() {
+            true => self.part("shm"),
+            false => Self::memory_of_user().join(self.prefix()),
+        }
+    }
+
+    /// Returns the directory of the memory that this user has in the domains of groups.
+    fn memory_of_user() -> PathBuf {
+        let user = rustix::process::geteuid().as_raw();
+        UserDir::find(Path::new("/dev/shm"), user).path
+    }
+
+    /// Creates the directory above that of the shared memory.
+    fn create_memory_of_user(&self) {
+        if !self.group.is_empty() {
+            // Without it, shared memory cannot be opened, and reports that.
+            drop(DomainUsers::This.create_directory(&Self::memory_of_user()));
+        }
+    }
+
+    /// Returns the path of a subdirectory, for example `directory` or `unix`.
     pub(crate) fn part(&self, name: &str) -> PathBuf {
         self.path().join(name)
     }
 
     /// Returns the prefix of the names of this domain's shared memory. It differs for domains of
     /// other users and in other directories.
-    #[cfg_attr(
-        not(feature = "shm"),
-        expect(dead_code, reason = "there is no shared memory")
-    )]
     pub(crate) fn prefix(&self) -> String {
         let path = self.path();
         let path = path.as_os_str().as_encoded_bytes();
+        // The users of a group share no memory.
+        let user = match self.group.is_empty() {
+            true => 0,
+            false => rustix::process::geteuid().as_raw(),
+        };
         // Half of the hash, since names of files in shared memory are short.
-        let hash = fnv1a(path.iter().copied()) as u32;
+        let hash = fnv1a(path.iter().copied().chain(user.to_le_bytes())) as u32;
         format!("fipa_{}_{hash:08x}", self.domain)
     }
 
@@ -322,7 +446,14 @@ impl DomainDir {
 
     /// Returns the host identifier from before the directory was removed and created again.
     fn saved_host_id(&self) -> Option<String> {
-        let text = fs::read_to_string(self.path().join(HOST)).ok()?;
+        // In a domain of a group, another member can put anything there.
+        let mut options = fs::File::options();
+        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits();
+        let file = options.read(true).custom_flags(flags as i32);
+        let file = file.open(self.path().join(HOST)).ok()?;
+        let mut text = String::new();
+        let limit = MAX_HOST as u64 + 1;
+        file.take(limit).read_to_string(&mut text).ok()?;
         let is_plain = text.bytes().all(|byte| byte.is_ascii_graphic());
         (is_plain && (1..=MAX_HOST).contains(&text.len())).then_some(text)
     }
@@ -334,12 +465,150 @@ impl DomainDir {
         names.all(|entry| entry.is_ok_and(|entry| is_file(&entry.file_name())))
     }
 
+    /// Returns the error for a directory that cannot be used, with its remedy.
+    fn unusable(&self, error: DirectoryError) -> DomainDirError {
+        let (path, intrusion) = match error {
+            DirectoryError::NotPrivate { path, intrusion } => (path, intrusion),
+            DirectoryError::Io { path, source, .. }
+                if source.kind() == io::ErrorKind::PermissionDenied =>
+            {
+                return self.not_writable(&path, source);
+            }
+            DirectoryError::Io { path, source, .. } => return DomainDirError::Io { path, source },
+            // The enum may grow.
+            other => return io_error(&self.path())(io::Error::other(other)),
+        };
+        let at = path.display();
+        let (problem, remedy) = match intrusion {
+            Intrusion::Owner(owner) => {
+                let owner = user_name(owner);
+                (
+                    format!("it belongs to {owner}, and a domain belongs to one user"),
+                    format!(
+                        "run all processes of the domain as {owner}, share the domain with a group (key group), or \
+                         {ANOTHER}"
+                    ),
+                )
+            }
+            Intrusion::Group { found, expected } => (
+                format!(
+                    "it belongs to {}, not to {}",
+                    group_name(found),
+                    group_name(expected)
+                ),
+                format!("run: chgrp {} {at} && chmod 770 {at}", escape(&self.group)),
+            ),
+            Intrusion::Mode(_) => (
+                intrusion.to_string(),
+                match self.group.is_empty() {
+                    true => format!("run: chmod 700 {at} (systemd: RuntimeDirectoryMode=0700)"),
+                    false => format!("run: chmod 770 {at} (systemd: RuntimeDirectoryMode=0770)"),
+                },
+            ),
+            other => (other.to_string(), ANOTHER.to_owned()),
+        };
+        DomainDirError::NotPrivate {
+            path,
+            problem,
+            remedy,
+        }
+    }
+
+    /// Returns the error for a directory in which no file can be written, with the cause and the remedy.
+    fn not_writable(&self, path: &Path, source: io::Error) -> DomainDirError {
+        let user = || user_name(rustix::process::geteuid().as_raw());
+        let at = path.display();
+        let (problem, remedy) = match Errno::from_io_error(&source) {
+            Some(Errno::NOSPC) => match rustix::fs::statvfs(path) {
+                Ok(found) if found.f_files > 0 && found.f_favail == 0 => (
+                    format!(
+                        "its file system has no inodes left: 0 of {} are free",
+                        found.f_files
+                    ),
+                    format!("delete files there (`df -i {at}`), or {ANOTHER}"),
+                ),
+                Ok(found) => {
+                    let size = |blocks: u64| ByteSize::b(blocks.saturating_mul(found.f_frsize));
+                    let (free, total) = (size(found.f_bavail), size(found.f_blocks));
+                    (
+                        format!("its file system is full: {free} free of {total}"),
+                        format!("delete files on it or enlarge it (`df -h {at}`), or {ANOTHER}"),
+                    )
+                }
+                Err(_) => (
+                    "its file system is full".to_owned(),
+                    format!("delete files on it, or {ANOTHER}"),
+                ),
+            },
+            Some(Errno::DQUOT) => (
+                format!("the disk quota of {} is used up", user()),
+                format!("delete files of this user, raise its quota, or {ANOTHER}"),
+            ),
+            Some(Errno::ROFS) => (
+                "its file system is read-only".to_owned(),
+                format!(
+                    "mount it writable (`findmnt -T {at}` shows the mount, `dmesg` an error of the disk), or {ANOTHER}"
+                ),
+            ),
+            Some(Errno::ACCESS | Errno::PERM) if !self.group.is_empty() => (
+                format!("{} may not create files in it", user()),
+                format!(
+                    "add the user to the group (`adduser USER {}`), log in again, and see that the group may write \
+                     there (`ls -ld {at}`)",
+                    escape(&self.group)
+                ),
+            ),
+            Some(Errno::ACCESS | Errno::PERM) => (
+                format!("{} may not write in it", user()),
+                format!("give the directory to this user (`ls -ld {at}`), or {ANOTHER}"),
+            ),
+            _ => (
+                "no file can be written in it".to_owned(),
+                format!("repair it, or {ANOTHER}"),
+            ),
+        };
+        DomainDirError::NotWritable {
+            path: path.to_owned(),
+            problem,
+            remedy,
+            source,
+        }
+    }
+
+    /// Opens a level and takes a shared lock on it.
+    fn lock_shared(&self, path: &Path) -> Result<OwnedFd, DomainDirError> {
+        let directory = self.check(path)?;
+        let began = Instant::now();
+        loop {
+            match rustix::fs::flock(&directory, FlockOperation::NonBlockingLockShared) {
+                Ok(()) => break,
+                Err(Errno::WOULDBLOCK) if began.elapsed() < LOCK_TIMEOUT => {
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+                // The lock is optional: the process joins again if the directory is removed.
+                Err(error) => {
+                    log_limit::warn!(
+                        %error,
+                        "cannot lock {}, so cleaners of temporary files may remove it; exempt it from \
+                         cleaning, or set FIPA_RUNTIME_DIR to another directory",
+                        path.display()
+                    );
+                    break;
+                }
+            }
+        }
+        match is_same(&directory, path) {
+            true => Ok(directory),
+            false => Err(io_error(path)(io::ErrorKind::NotFound.into())),
+        }
+    }
+
     /// Removes the empty directories of the domain. Those that other processes use are not empty and stay.
     pub(crate) fn leave(&self) {
         // Fails if the directory is not empty or does not exist, and then nothing is to be done.
         let remove = |path: PathBuf| drop(fs::remove_dir(path));
         remove(self.part("directory"));
-        remove(self.part("shm"));
+        remove(self.memory());
         remove(self.part("unix"));
         if self.is_empty_but_for_files() {
             for file in FILES {
@@ -347,41 +616,6 @@ impl DomainDir {
             }
         }
         remove(self.path());
-    }
-}
-
-/// Opens a directory and takes a shared lock on it.
-fn lock_shared(path: &Path) -> Result<OwnedFd, DomainDirError> {
-    let io_error = |source| DomainDirError::Io {
-        path: path.to_owned(),
-        source,
-    };
-    let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
-    let directory =
-        rustix::fs::open(path, flags, Mode::empty()).map_err(|error| io_error(error.into()))?;
-    let began = Instant::now();
-    loop {
-        match rustix::fs::flock(&directory, FlockOperation::NonBlockingLockShared) {
-            Ok(()) => break,
-            Err(Errno::WOULDBLOCK) if began.elapsed() < LOCK_TIMEOUT => {
-                std::thread::sleep(Duration::from_millis(5));
-            }
-            // The lock is optional: the process joins again if the directory is removed.
-            Err(error) => {
-                log_limit::warn!(
-                    %error,
-                    "cannot lock {}, so cleaners of temporary files may remove it; exempt it from \
-                     cleaning, or set FIPA_RUNTIME_DIR to another directory",
-                    path.display()
-                );
-                break;
-            }
-        }
-    }
-    check_private(path)?;
-    match is_same(&directory, path) {
-        true => Ok(directory),
-        false => Err(io_error(io::ErrorKind::NotFound.into())),
     }
 }
 
@@ -418,59 +652,6 @@ fn write_in(directory: &Path) -> io::Result<()> {
     written
 }
 
-/// Returns the error for a directory in which no file can be written, with the cause and the remedy.
-fn not_writable(path: &Path, source: io::Error) -> DomainDirError {
-    let user = || user_name(rustix::process::geteuid().as_raw());
-    let at = path.display();
-    let (problem, remedy) = match Errno::from_io_error(&source) {
-        Some(Errno::NOSPC) => match rustix::fs::statvfs(path) {
-            Ok(found) if found.f_files > 0 && found.f_favail == 0 => (
-                format!(
-                    "its file system has no inodes left: 0 of {} are free",
-                    found.f_files
-                ),
-                format!("delete files there (`df -i {at}`), or {ANOTHER}"),
-            ),
-            Ok(found) => {
-                let size = |blocks: u64| ByteSize::b(blocks.saturating_mul(found.f_frsize));
-                let (free, total) = (size(found.f_bavail), size(found.f_blocks));
-                (
-                    format!("its file system is full: {free} free of {total}"),
-                    format!("delete files on it or enlarge it (`df -h {at}`), or {ANOTHER}"),
-                )
-            }
-            Err(_) => (
-                "its file system is full".to_owned(),
-                format!("delete files on it, or {ANOTHER}"),
-            ),
-        },
-        Some(Errno::DQUOT) => (
-            format!("the disk quota of {} is used up", user()),
-            format!("delete files of this user, raise its quota, or {ANOTHER}"),
-        ),
-        Some(Errno::ROFS) => (
-            "its file system is read-only".to_owned(),
-            format!(
-                "mount it writable (`findmnt -T {at}` shows the mount, `dmesg` an error of the disk), or {ANOTHER}"
-            ),
-        ),
-        Some(Errno::ACCESS | Errno::PERM) => (
-            format!("{} may not write in it", user()),
-            format!("give the directory to this user (`ls -ld {at}`), or {ANOTHER}"),
-        ),
-        _ => (
-            "no file can be written in it".to_owned(),
-            format!("repair it, or {ANOTHER}"),
-        ),
-    };
-    DomainDirError::NotWritable {
-        path: path.to_owned(),
-        problem,
-        remedy,
-        source,
-    }
-}
-
 /// Renews the timestamps of all files below a directory.
 fn renew_below(directory: &Path, depth: usize, budget: &mut usize) {
     let found = fs::read_dir(directory).into_iter().flatten().flatten();
@@ -503,50 +684,9 @@ fn touch(path: &Path, modification: bool) {
     let _ = rustix::fs::utimensat(CWD, path, &times, AtFlags::SYMLINK_NOFOLLOW);
 }
 
-fn make_private(path: &Path) -> Result<(), DomainDirError> {
-    let io_error = |source| DomainDirError::Io {
-        path: path.to_owned(),
-        source,
-    };
-    match DirBuilder::new().mode(0o700).create(path) {
-        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => Err(io_error(error)),
-        _ => check_private(path),
-    }
-}
-
-fn check_private(path: &Path) -> Result<(), DomainDirError> {
-    let io_error = |source| DomainDirError::Io {
-        path: path.to_owned(),
-        source,
-    };
-    let metadata = fs::symlink_metadata(path).map_err(io_error)?;
-    let (problem, remedy) = if metadata.is_symlink() {
-        ("it is a symbolic link".to_owned(), ANOTHER.to_owned())
-    } else if !metadata.is_dir() {
-        ("it is a file".to_owned(), ANOTHER.to_owned())
-    } else if metadata.uid() != rustix::process::geteuid().as_raw() {
-        let owner = user_name(metadata.uid());
-        let problem = format!("it belongs to {owner}, and a domain belongs to one user");
-        let remedy = format!("run all processes of the domain as {owner}, or {ANOTHER}");
-        (problem, remedy)
-    } else if metadata.mode() & 0o077 != 0 {
-        let problem = format!(
-            "its mode is {:03o}, with which other users can enter it",
-            metadata.mode() & 0o777
-        );
-        let remedy = format!(
-            "run: chmod 700 {} (systemd: RuntimeDirectoryMode=0700)",
-            path.display()
-        );
-        (problem, remedy)
-    } else {
-        return Ok(());
-    };
-    Err(DomainDirError::NotPrivate {
-        path: path.to_owned(),
-        problem,
-        remedy,
-    })
+fn io_error(path: &Path) -> impl FnOnce(io::Error) -> DomainDirError {
+    let path = path.to_owned();
+    move |source| DomainDirError::Io { path, source }
 }
 
 /// The remedy for a directory that this user cannot repair.

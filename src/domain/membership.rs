@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use fipa_sds::{Cancellation, HostConfig, HostDirectory, HostError, Role};
+use fipa_transport::DirectoryError;
 
 use crate::domain::files::{DomainDir, RETRIES};
 use crate::error::OpenError;
@@ -39,7 +40,7 @@ impl Domain {
         if !dir.exists()? {
             return Ok(Vec::new());
         }
-        Ok(HostDirectory::peek(&dir.part("directory"))?)
+        Ok(HostDirectory::peek(&dir.part("directory"), dir.users()?)?)
     }
 }
 
@@ -65,6 +66,7 @@ pub(crate) fn join(
         let mut dir = DomainDir::prepare(config)?;
         let host = HostConfig {
             dir: dir.part("directory"),
+            users: dir.users()?,
             mts: own.clone(),
             gateway,
             brief,
@@ -88,7 +90,9 @@ pub(crate) fn join(
 /// Whether the error means that a leaving process removed the directory between creation and join.
 fn was_removed(error: &HostError) -> bool {
     match error {
-        HostError::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
+        HostError::Io { source, .. } | HostError::Directory(DirectoryError::Io { source, .. }) => {
+            source.kind() == std::io::ErrorKind::NotFound
+        }
         HostError::Removed { .. } => true,
         _ => false,
     }

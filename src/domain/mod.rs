@@ -1,5 +1,6 @@
 //! The membership of a process in a domain.
 
+pub(crate) mod accounts;
 pub(crate) mod background;
 pub(crate) mod change_log;
 pub(crate) mod coalition;

@@ -502,7 +502,7 @@ impl TransportParts<'_> {
             max_letter: usize::try_from(settings.max_letter).unwrap_or(usize::MAX),
             answers_late: self.role.gateway,
             ..ShmConfig::new(
-                self.maintenance.dir.part("shm"),
+                self.maintenance.dir.memory(),
                 self.maintenance.dir.prefix(),
                 self.incarnation,
             )
@@ -519,6 +519,7 @@ impl TransportParts<'_> {
         use fipa_transport_net::{UnixConfig, UnixTransport};
         let config = UnixConfig {
             directory: self.maintenance.dir.part("unix"),
+            users: self.maintenance.host.users(),
             identity: self.identity()?,
             limits: stream_limits(self.config),
         };

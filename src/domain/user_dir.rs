@@ -13,9 +13,10 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use fipa_acl::escape;
 use fipa_transport::log_limit;
 use rustix::fs::{FlockOperation, Mode, OFlags};
+
+use super::accounts::user_name;
 
 /// Length of the end of another name, in hexadecimal digits.
 const DIGITS: usize = 16;
@@ -102,25 +103,6 @@ pub(crate) fn user_in(name: &str) -> Option<u32> {
         }
     };
     user.parse().ok()
-}
-
-/// Returns the name of a user with its identifier. Users that are not in `/etc/passwd` have no name.
-pub(crate) fn user_name(uid: u32) -> String {
-    let users = fs::read_to_string("/etc/passwd").unwrap_or_default();
-    match name_in(&users, uid) {
-        Some(name) => format!("user {} ({uid})", escape(name)),
-        None => format!("user {uid}"),
-    }
-}
-
-/// Finds the name of a user in the text of `/etc/passwd`.
-fn name_in(users: &str, uid: u32) -> Option<&str> {
-    users.lines().find_map(|line| {
-        let mut fields = line.split(':');
-        let name = fields.next().filter(|name| !name.is_empty())?;
-        let found = fields.nth(1)?;
-        (found.parse() == Ok(uid)).then_some(name)
-    })
 }
 
 /// Returns the directory with another name. Of several, which processes have created at the same time, all
@@ -299,13 +281,5 @@ mod tests {
         ] {
             assert_eq!(user_in(name), user, "{name}");
         }
-    }
-
-    #[test]
-    fn the_name_of_a_user_is_read_from_its_line() {
-        let users = "root:x:0:0:root:/root:/bin/sh\nrobot:x:1001:1001::/home/robot:/bin/sh\n";
-        assert_eq!(name_in(users, 1001), Some("robot"));
-        assert_eq!(name_in(users, 1), None);
-        assert_eq!(name_in("broken\n:x:5\n", 5), None);
     }
 }

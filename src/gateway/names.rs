@@ -77,6 +77,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let host = HostDirectory::open(HostConfig {
             brief: false,
+            users: fipa_transport::DomainUsers::This,
             dir: place.path().join("domain"),
             mts: MtsId::new("mts", Incarnation::from_u64(1)),
             gateway: true,

@@ -149,6 +149,7 @@ impl TestService {
         });
         let unix = has(Kind::Unix).then(|| {
             let config = UnixConfig {
+                users: fipa_transport::DomainUsers::This,
                 directory: host.join("unix"),
                 identity: identity.clone(),
                 limits: limits.clone(),

@@ -5,6 +5,7 @@
 //! * [`Outcome`] is the final result of a letter, one per receiver.
 //! * [`wire`] is the fixed layout of a parcel in mailboxes and network frames.
 //! * [`OwnerProcess`] tells a process from a forked child.
+//! * [`DomainUsers`] are the users whose processes share the files of a domain.
 //! * [`PeerId`] names the party that has one share of a bound.
 //! * [`TokenBucket`] limits the rate of a peer or a sender.
 //! * [`log_limit`] limits the rate of log lines.
@@ -33,6 +34,7 @@ mod serde_text;
 pub mod threads;
 mod token_bucket;
 mod transport;
+mod users;
 pub mod wire;
 
 pub use conclusion::{Abandoned, Answer, Conclusion};
@@ -52,3 +54,4 @@ pub use transport::{
     Arrival, Arriving, AttemptId, Hop, Introduction, LegacySource, LoanedContent, Mandate,
     Reaction, Sink, Ticket, Transport,
 };
+pub use users::{DirectoryError, DomainUsers, Intrusion};

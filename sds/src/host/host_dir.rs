@@ -4,14 +4,14 @@
 //! that the directory that was checked is the one that is used.
 
 use std::collections::BTreeSet;
-use std::fs::{DirBuilder, File, TryLockError};
+use std::fs::{File, TryLockError};
 use std::io::{self, Read as _, Write as _};
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::{DirBuilderExt as _, FileExt as _};
+use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use fipa_transport::log_limit;
+use fipa_transport::{DirectoryError, DomainUsers, log_limit};
 use parking_lot::{Mutex, MutexGuard};
 use rustix::fs::{AtFlags, FileType, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
@@ -80,6 +80,7 @@ impl std::fmt::Display for Name {
 pub(super) struct HostDir {
     path: PathBuf,
     dir: OwnedFd,
+    users: DomainUsers,
     domain: File,
     /// An advisory lock belongs to the open file, which the threads of this process share; this
     /// mutex excludes them from each other. It holds the start of this process's turn.
@@ -120,16 +121,18 @@ impl HostDir {
     /// ID.
     pub(super) fn join(
         path: &Path,
+        users: DomainUsers,
         id: Id,
         cancellation: &Cancellation,
     ) -> Result<Self, HostError> {
         // With a trailing slash, the kernel would follow a symbolic link.
         let path: PathBuf = path.components().collect();
-        let dir = open_private(&path)?;
+        let dir = users.create_directory(&path)?;
         let mut host_dir = Self {
-            domain: open_domain(&dir, &path)?,
+            domain: open_domain(&dir, &path, users, id)?,
             path,
             dir,
+            users,
             threads: Mutex::default(),
             id,
             process: Mutex::new(None),
@@ -137,7 +140,7 @@ impl HostDir {
         let deadline = Instant::now() + LONGEST;
         while !host_dir.try_join(cancellation)? {
             // The last process left in between and removed the lock file.
-            host_dir.domain = open_domain(&host_dir.dir, &host_dir.path)?;
+            host_dir.domain = open_domain(&host_dir.dir, &host_dir.path, users, id)?;
             if Instant::now() > deadline {
                 return Err(HostError::Busy {
                     path: host_dir.path,
@@ -148,19 +151,19 @@ impl HostDir {
     }
 
     /// Opens an existing directory for reading, without joining it. Returns `None` if there is none.
-    pub(super) fn look(path: &Path) -> Result<Option<Self>, HostError> {
+    pub(super) fn look(path: &Path, users: DomainUsers) -> Result<Option<Self>, HostError> {
         let path: PathBuf = path.components().collect();
-        let dir = match open_existing(&path) {
+        let dir = match users.open_directory(&path) {
             Ok(dir) => dir,
-            Err(HostError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+            Err(DirectoryError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
                 return Ok(None);
             }
-            Err(error) => return Err(error),
+            Err(error) => return Err(error.into()),
         };
         let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
         let name = Name::Domain;
         let domain = match rustix::fs::openat(&dir, name.to_string(), flags, Mode::empty()) {
-            Ok(file) => check_file(file, &path, name)?,
+            Ok(file) => check_file(file, &path, name, users)?,
             Err(Errno::NOENT) => return Ok(None),
             Err(error) => {
                 return Err(HostError::Io {
@@ -173,6 +176,7 @@ impl HostDir {
         Ok(Some(Self {
             path,
             dir,
+            users,
             domain,
             threads: Mutex::default(),
             id: Id(0),
@@ -203,6 +207,10 @@ impl HostDir {
 
     pub(super) fn id(&self) -> Id {
         self.id
+    }
+
+    pub(super) fn users(&self) -> DomainUsers {
+        self.users
     }
 
     /// Whether other processes can still find the directory and the files of this process.
@@ -454,10 +462,12 @@ impl HostDir {
     }
 
     /// Content of an entries file; `None` if it does not exist.
-    pub(super) fn read(&self, name: Name) -> Result<Option<Vec<u8>>, HostError> {
+    pub(super) fn read(&self, name: Name) -> Result<Option<Content>, HostError> {
         let Some(file) = self.open(name)? else {
             return Ok(None);
         };
+        let found = rustix::fs::fstat(&file);
+        let found = found.map_err(|error| self.io("examine", name)(error.into()))?;
         let mut bytes = Vec::new();
         let limit = MAX_SIZE as u64;
         // The size may change before the read, so the read is limited too.
@@ -469,26 +479,27 @@ impl HostDir {
                 path: self.path.join(name.to_string()),
             });
         }
-        Ok(Some(bytes))
+        Ok(Some(Content {
+            bytes,
+            of_this_user: DomainUsers::This.own(&found),
+        }))
     }
 
     /// Opens a file for reading; `None` if it does not exist. Fails when it is not a regular file
-    /// of this user.
+    /// of the users of the domain.
     pub(super) fn open(&self, name: Name) -> Result<Option<File>, HostError> {
         // Non-blocking, in case the name refers to a pipe.
         let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
         match rustix::fs::openat(&self.dir, name.to_string(), flags, Mode::empty()) {
-            Ok(file) => check_file(file, &self.path, name).map(Some),
+            Ok(file) => check_file(file, &self.path, name, self.users).map(Some),
             Err(Errno::NOENT) => Ok(None),
             Err(error) => Err(self.io("open", name)(error.into())),
         }
     }
 
     fn create(&self, name: Name) -> Result<File, HostError> {
-        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::CLOEXEC;
-        rustix::fs::openat(&self.dir, name.to_string(), flags, PRIVATE)
-            .map(File::from)
-            .map_err(|error| self.io("create", name)(error.into()))
+        let file = self.users.create_file(&self.dir, &name.to_string());
+        file.map(File::from).map_err(self.io("create", name))
     }
 
     pub(super) fn rename(&self, from: Name, to: Name) -> Result<(), HostError> {
@@ -507,6 +518,13 @@ impl HostDir {
         let path = self.path.join(name.to_string());
         move |source| HostError::Io { what, path, source }
     }
+}
+
+/// The content of a file.
+pub(super) struct Content {
+    pub(super) bytes: Vec<u8>,
+    /// Whether a process of this user has written it.
+    pub(super) of_this_user: bool,
 }
 
 /// Number of changes whose files are remembered, and the bytes of each: its process, and the kind of the file.
@@ -550,8 +568,6 @@ pub(super) struct Version {
 
 /// Maximum number of files in a directory: five per process, for more processes than a host runs.
 const MAX_FILES: usize = 100_000;
-
-const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
 
 /// The turn to wait for the lock of the domain; dropping it releases the turn.
 struct Turn<'a>(&'a HostDir);
@@ -643,7 +659,8 @@ impl Guard<'_> {
         for name in self.host_dir.names()? {
             let id = match name {
                 Name::Domain => continue,
-                // Written under this lock only, so no process is about to rename it.
+                // No process is about to rename it: that happens under this lock only. A process that creates the
+                // lock file tolerates the removal.
                 Name::Temporary(_) => {
                     self.host_dir.remove(name)?;
                     continue;
@@ -683,70 +700,43 @@ impl Guard<'_> {
     }
 }
 
-fn open_private(path: &Path) -> Result<OwnedFd, HostError> {
-    let io = |what| {
-        let path = path.to_owned();
-        move |source| HostError::Io { what, path, source }
-    };
-    let create = DirBuilder::new().recursive(true).mode(0o700).create(path);
-    match create {
-        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
-            return Err(io("create")(error));
-        }
-        // An existing path, which may be of any type, is checked below.
-        _ => {}
-    }
-    open_existing(path)
-}
-
-/// Opens a directory if it is private.
-fn open_existing(path: &Path) -> Result<OwnedFd, HostError> {
-    let io = |what| {
-        let path = path.to_owned();
-        move |source| HostError::Io { what, path, source }
-    };
-    let refused = |why: String| HostError::NotPrivate {
-        path: path.to_owned(),
-        why,
-    };
-    let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
-    let dir = match rustix::fs::open(path, flags, Mode::empty()) {
-        Ok(dir) => dir,
-        Err(Errno::LOOP | Errno::NOTDIR) => {
-            return Err(refused(
-                "it is a symbolic link or a file, not a directory".into(),
-            ));
-        }
-        Err(error) => return Err(io("open")(error.into())),
-    };
-    let stat = rustix::fs::fstat(&dir).map_err(|error| io("examine")(error.into()))?;
-    let me = rustix::process::geteuid().as_raw();
-    if stat.st_uid != me {
-        let why = format!("it belongs to user {}, and this is user {me}", stat.st_uid);
-        return Err(refused(why));
-    }
-    if stat.st_mode & 0o077 != 0 {
-        let mode = stat.st_mode & 0o7777;
-        let why = format!("its mode is {mode:04o} and should be 0700");
-        return Err(refused(why));
-    }
-    Ok(dir)
-}
-
-fn open_domain(dir: &OwnedFd, path: &Path) -> Result<File, HostError> {
-    let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+/// Opens the lock file of the domain, and creates it if it is missing.
+fn open_domain(dir: &OwnedFd, path: &Path, users: DomainUsers, id: Id) -> Result<File, HostError> {
     let name = Name::Domain;
-    match rustix::fs::openat(dir, name.to_string(), flags | OFlags::NONBLOCK, PRIVATE) {
-        Ok(file) => check_file(file, path, name),
-        Err(error) => Err(HostError::Io {
-            what: "open",
-            path: path.join(name.to_string()),
-            source: error.into(),
-        }),
+    let io = |what| {
+        let path = path.join(name.to_string());
+        move |source| HostError::Io { what, path, source }
+    };
+    let flags = OFlags::RDWR | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let open = || match rustix::fs::openat(dir, name.to_string(), flags, Mode::empty()) {
+        Ok(file) => check_file(file, path, name, users).map(Some),
+        Err(Errno::NOENT) => Ok(None),
+        Err(error) => Err(io("open")(error.into())),
+    };
+    loop {
+        if let Some(file) = open()? {
+            return Ok(file);
+        }
+        // Appears under its name only when all users of the domain can open it.
+        let temporary = Name::Temporary(id).to_string();
+        let file = users.create_file(dir, &temporary).map_err(io("create"))?;
+        let linked = rustix::fs::linkat(dir, &temporary, dir, name.to_string(), AtFlags::empty());
+        let removed = rustix::fs::unlinkat(dir, &temporary, AtFlags::empty());
+        match linked.and(removed) {
+            Ok(()) => return Ok(File::from(file)),
+            // Another process has created it, or has swept the temporary file away.
+            Err(Errno::EXIST | Errno::NOENT) => {}
+            Err(error) => return Err(io("create")(error.into())),
+        }
     }
 }
 
-fn check_file(file: OwnedFd, dir: &Path, name: Name) -> Result<File, HostError> {
+fn check_file(
+    file: OwnedFd,
+    dir: &Path,
+    name: Name,
+    users: DomainUsers,
+) -> Result<File, HostError> {
     let path = dir.join(name.to_string());
     let stat = match rustix::fs::fstat(&file) {
         Ok(stat) => stat,
@@ -756,10 +746,10 @@ fn check_file(file: OwnedFd, dir: &Path, name: Name) -> Result<File, HostError> 
         }
     };
     let is_file = FileType::from_raw_mode(stat.st_mode) == FileType::RegularFile;
-    if is_file && stat.st_uid == rustix::process::geteuid().as_raw() {
+    if is_file && users.own(&stat) {
         return Ok(File::from(file));
     }
-    let why = "it is not a regular file of this user".to_owned();
+    let why = "it is not a regular file of the users of this domain".to_owned();
     Err(HostError::NotPrivate { path, why })
 }
 

@@ -30,7 +30,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::ErrorChain;
-use fipa_transport::{Forked, Incarnation, OwnerProcess, log_limit};
+use fipa_transport::{DirectoryError, DomainUsers, Forked, Incarnation, OwnerProcess, log_limit};
 use inotify::{WatchMask, Watches};
 use parking_lot::Mutex;
 use tokio::sync::watch;
@@ -48,9 +48,11 @@ use crate::{
 /// Configuration of [`HostDirectory`].
 #[derive(Debug, Clone)]
 pub struct HostConfig {
-    /// The private directory of the domain. It is created with mode 0700 if it does not exist, and
-    /// refused if another user owns it or may access it, or if it is a symbolic link.
+    /// The directory of the domain. It is created if it does not exist, in a directory that exists. It is refused
+    /// if other users may enter it, or if it is a symbolic link.
     pub dir: PathBuf,
+    /// The users of the domain.
+    pub users: DomainUsers,
     /// The message transport service of this process.
     pub mts: MtsId,
     /// Whether this process may publish agents of other hosts.
@@ -92,7 +94,7 @@ impl HostDirectory {
         let runtime = tokio::runtime::Handle::try_current().map_err(|_| HostError::NoRuntime)?;
         // Not the service's incarnation, because a process may open the directory more than once.
         let id = Id(Incarnation::random().as_u64());
-        let host_dir = HostDir::join(&config.dir, id, cancellation)?;
+        let host_dir = HostDir::join(&config.dir, config.users, id, cancellation)?;
         let shared = Arc::new(Shared::new(host_dir, config.mts.clone()));
         // Starts to watch before reading, so that no change is missed in between.
         let watcher = match config.brief {
@@ -122,8 +124,8 @@ impl HostDirectory {
     ///
     /// # Errors
     /// Fails when the directory is not private, or cannot be read.
-    pub fn peek(dir: &Path) -> Result<Vec<Arc<Entry>>, HostError> {
-        let Some(host_dir) = HostDir::look(dir)? else {
+    pub fn peek(dir: &Path, users: DomainUsers) -> Result<Vec<Arc<Entry>>, HostError> {
+        let Some(host_dir) = HostDir::look(dir, users)? else {
             return Ok(Vec::new());
         };
         let mut found: Vec<Arc<Entry>> = Vec::new();
@@ -131,8 +133,8 @@ impl HostDirectory {
             match name {
                 Name::Entries(id)
                     if host_dir.is_running(id).unwrap_or(false)
-                        && let Ok(Some(bytes)) = host_dir.read(name)
-                        && let Ok(entries) = file::read(&bytes) =>
+                        && let Ok(Some(content)) = host_dir.read(name)
+                        && let Ok(entries) = file::read(&content.bytes) =>
                 {
                     found.extend(entries.into_values());
                 }
@@ -210,6 +212,12 @@ impl HostDirectory {
             .replace(entries.collect::<Result<_, _>>()?, leaving)
     }
 
+    /// Returns the users of the domain.
+    #[must_use]
+    pub fn users(&self) -> DomainUsers {
+        self.config.users
+    }
+
     /// Returns notifications of processes of this host that end, gracefully or not.
     #[must_use]
     pub fn departures(&self) -> Departures {
@@ -233,11 +241,11 @@ impl HostDirectory {
         self.shared.sockets()
     }
 
-    /// Connects to another process of the domain and of this user without blocking.
+    /// Connects to another process of the domain without blocking.
     ///
     /// # Errors
     /// Fails when that process has ended, when too many of its connections are not accepted yet
-    /// ([`io::ErrorKind::WouldBlock`]), or when the socket is not of this user.
+    /// ([`io::ErrorKind::WouldBlock`]), or when the socket is not of a user of the domain.
     pub fn connect(&self, socket: SocketId) -> Result<OwnedFd, HostError> {
         self.shared.host_dir().connect(socket.0)
     }
@@ -377,6 +385,9 @@ pub struct SocketId(Id);
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum HostError {
+    /// The directory cannot be used.
+    #[error(transparent)]
+    Directory(#[from] DirectoryError),
     /// Another user could read or change the path.
     #[error("refusing to use {}: {why}; remove it, or configure another directory", path.display())]
     NotPrivate {

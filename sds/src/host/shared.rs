@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use arc_swap::ArcSwap;
 use fipa_acl::ErrorChain;
-use fipa_transport::{Incarnation, log_limit};
+use fipa_transport::{Incarnation, Kind, log_limit};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
@@ -132,6 +132,7 @@ impl Shared {
         let before = self.host_dir();
         let host_dir = Arc::new(HostDir::join(
             before.path(),
+            before.users(),
             before.id(),
             &Cancellation::new(),
         )?);
@@ -288,7 +289,13 @@ impl Shared {
         }
         let read = || -> Result<Entries, ReadError> {
             match self.host_dir().read(name)? {
-                Some(bytes) => Ok(file::read(&bytes)?),
+                Some(content) => {
+                    let entries = file::read(&content.bytes)?;
+                    Ok(match content.of_this_user {
+                        true => entries,
+                        false => without_memory(entries),
+                    })
+                }
                 None => Ok(Entries::default()),
             }
         };
@@ -638,6 +645,16 @@ enum WriteError {
     Full(String),
     #[error(transparent)]
     Host(#[from] HostError),
+}
+
+/// Removes the locations in shared memory, which belongs to one user.
+fn without_memory(entries: Entries) -> Entries {
+    let entries = entries.into_iter().map(|(name, entry)| {
+        let mut entry = Arc::unwrap_or_clone(entry);
+        entry.locations.retain(|it| it.kind() != Kind::Shm);
+        (name, Arc::new(entry))
+    });
+    entries.collect()
 }
 
 impl From<WriteError> for RegisterError {

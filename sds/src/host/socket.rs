@@ -2,7 +2,7 @@
 
 use std::os::fd::OwnedFd;
 
-use rustix::fs::{AtFlags, FileType, Mode, OFlags};
+use rustix::fs::{FileType, Mode, OFlags};
 use rustix::io::Errno;
 use rustix::net::sockopt::socket_peercred;
 use rustix::net::{
@@ -25,17 +25,14 @@ impl Guard<'_> {
                 // The full path may exceed the length limit of a socket's path.
                 let path = host_dir.pinned_path().join(temporary.to_string());
                 bind(&socket, &SocketAddrUnix::new(&path)?)?;
-                let private = Mode::RUSR | Mode::WUSR;
-                rustix::fs::chmodat(
-                    host_dir.dir(),
-                    temporary.to_string(),
-                    private,
-                    AtFlags::empty(),
-                )?;
                 listen(&socket, BACKLOG)?;
                 Ok(socket)
             })
             .map_err(|error| host_dir.io("listen at", temporary)(error.into()))?;
+        let shared = host_dir
+            .users()
+            .share_socket(host_dir.dir(), &temporary.to_string());
+        shared.map_err(host_dir.io("listen at", temporary))?;
         // Appears under its name only now that it accepts connections.
         host_dir.rename(temporary, Name::Socket(host_dir.id()))?;
         Ok(socket)
@@ -53,13 +50,13 @@ impl HostDir {
         let file = rustix::fs::openat(self.dir(), name.to_string(), flags, Mode::empty());
         let file = file.map_err(failed)?;
         let stat = rustix::fs::fstat(&file).map_err(failed)?;
-        let me = rustix::process::geteuid();
+        let users = self.users();
         let refused = |why: &str| HostError::NotPrivate {
             path: self.path().join(name.to_string()),
             why: why.to_owned(),
         };
-        if FileType::from_raw_mode(stat.st_mode) != FileType::Socket || stat.st_uid != me.as_raw() {
-            return Err(refused("it is not a socket of this user"));
+        if FileType::from_raw_mode(stat.st_mode) != FileType::Socket || !users.own(&stat) {
+            return Err(refused("it is not a socket of the users of this domain"));
         }
         let path = format!("/proc/self/fd/{}", file.as_raw_fd());
         let connected = new_socket().and_then(|socket| {
@@ -67,7 +64,8 @@ impl HostDir {
             Ok(socket)
         });
         let socket = connected.map_err(failed)?;
-        if socket_peercred(&socket).map_err(failed)?.uid != me {
+        let peer = socket_peercred(&socket).map_err(failed)?;
+        if !users.admit(peer.uid.as_raw()) {
             return Err(refused("another user listens there"));
         }
         Ok(socket)

@@ -10,7 +10,8 @@ use rustix::process::geteuid;
 
 use super::{Area, Check, Severity};
 use crate::Config;
-use crate::domain::user_dir::{user_in, user_name};
+use crate::domain::accounts::user_name;
+use crate::domain::user_dir::user_in;
 
 const AREA: Area = Area("domain");
 const CHECK: &str = "domains of other users";

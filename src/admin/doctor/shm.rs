@@ -38,7 +38,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let dir = DomainDir::of(config);
     let settings = ShmConfig {
         capacity: config.transport.shm.capacity,
-        ..ShmConfig::new(dir.part("shm"), dir.prefix(), Incarnation::random())
+        ..ShmConfig::new(dir.memory(), dir.prefix(), Incarnation::random())
     };
     match inspect(&settings) {
         Ok(found) => {

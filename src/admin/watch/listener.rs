@@ -5,7 +5,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use fipa_mts::watch::record::{MAX_LEN, Wish};
 use fipa_mts::watch::{Record, RecordError, RecordSource};
-use fipa_transport::log_limit;
+use fipa_transport::{DomainUsers, log_limit};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -24,7 +24,12 @@ pub(super) enum ProcessEvent {
 const MAX_PROCESSES: usize = 1024;
 
 /// Accepts processes and forwards their events, until it is aborted.
-pub(super) async fn run(listener: UnixListener, wish: Wish, events: mpsc::Sender<ProcessEvent>) {
+pub(super) async fn run(
+    listener: UnixListener,
+    users: DomainUsers,
+    wish: Wish,
+    events: mpsc::Sender<ProcessEvent>,
+) {
     let mut processes = JoinSet::new();
     let mut number = 0;
     loop {
@@ -32,7 +37,8 @@ pub(super) async fn run(listener: UnixListener, wish: Wish, events: mpsc::Sender
         match listener.accept().await {
             Ok((process, _)) if processes.len() < MAX_PROCESSES => {
                 number += 1;
-                processes.spawn(listen(process, RecordSource(number), wish, events.clone()));
+                let source = RecordSource(number);
+                processes.spawn(listen(process, users, source, wish, events.clone()));
             }
             Ok(_) => log_limit::warn!(
                 "refused a process: {MAX_PROCESSES} processes, the maximum, are watched already"
@@ -48,13 +54,14 @@ pub(super) async fn run(listener: UnixListener, wish: Wish, events: mpsc::Sender
 
 async fn listen(
     process: UnixStream,
+    users: DomainUsers,
     source: RecordSource,
     wish: Wish,
     events: mpsc::Sender<ProcessEvent>,
 ) {
-    // The directory is private, but records must be from processes of this user in any case.
+    // The directory is private, but records must be from users of the domain in any case.
     let peer = match process.peer_cred() {
-        Ok(peer) if peer.uid() == rustix::process::geteuid().as_raw() => peer,
+        Ok(peer) if users.admit(peer.uid()) => peer,
         _ => return,
     };
     let name = format!("process {}", peer.pid().unwrap_or_default());

@@ -86,7 +86,12 @@ impl Watcher {
         })?;
         let content = u32::try_from(options.content.min(MAX_CONTENT)).unwrap_or(u32::MAX);
         let (sender, events) = mpsc::channel(MAX_WAITING);
-        let accepting = tokio::spawn(listener::run(socket, Wish { content }, sender));
+        let accepting = tokio::spawn(listener::run(
+            socket,
+            host.users(),
+            Wish { content },
+            sender,
+        ));
         let maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host));
         let mut watcher = Self {
             events,

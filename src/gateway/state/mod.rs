@@ -16,8 +16,9 @@ use std::time::{Duration, Instant};
 use fipa_acl::ErrorChain;
 use fipa_platform::{Platform, StoredDescription, StoredSubscription};
 use fipa_sds::{ContactDirectory, Directory, Entry, Watch};
-use fipa_transport::{Incarnation, Location, Principal, Signature, log_limit};
+use fipa_transport::{DomainUsers, Incarnation, Location, Principal, Signature, log_limit};
 use parking_lot::Mutex;
+use rustix::fs::OFlags;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 use tokio::runtime::Handle;
@@ -557,13 +558,23 @@ fn boot_time() -> u64 {
     u64::try_from(elapsed.as_millis()).unwrap_or(u64::MAX)
 }
 
-/// Reads a file, at most one byte more than it may have.
+/// Reads a file of this user, at most one byte more than it may have. In a domain of a group, another user may have put
+/// something else in its place.
 fn read(path: &Path) -> io::Result<Option<Vec<u8>>> {
-    let file = match File::open(path) {
+    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits();
+    let opened = File::options()
+        .read(true)
+        .custom_flags(flags as i32)
+        .open(path);
+    let file = match opened {
         Ok(file) => file,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(error),
     };
+    if !DomainUsers::This.own(&rustix::fs::fstat(&file)?) {
+        let what = "the file belongs to another user";
+        return Err(io::Error::new(io::ErrorKind::PermissionDenied, what));
+    }
     let mut bytes = Vec::new();
     file.take(MAX_BYTES as u64 + 1).read_to_end(&mut bytes)?;
     Ok(Some(bytes))
@@ -571,8 +582,13 @@ fn read(path: &Path) -> io::Result<Option<Vec<u8>>> {
 
 /// Replaces a file by another one, which only this user can read.
 fn replace(path: &Path, new: &Path, bytes: &[u8]) -> io::Result<()> {
+    // A gateway that was killed may have left one.
+    match fs::remove_file(new) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
     let mut options = File::options();
-    options.write(true).create(true).truncate(true).mode(0o600);
+    options.write(true).create_new(true).mode(0o600);
     options.open(new)?.write_all(bytes)?;
     fs::rename(new, path)
 }

@@ -31,7 +31,7 @@ impl QuotaKey {
 /// The other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Source {
-    /// A process of this host and of this user, by its process number (Unix domain socket).
+    /// A process of this host and domain, by its process number (Unix domain socket).
     Process(i32),
     /// An address (TCP and QUIC).
     #[cfg(feature = "ip")]

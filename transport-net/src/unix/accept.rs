@@ -1,9 +1,9 @@
-//! The listening side: accepts connections of this user.
+//! The listening side: accepts connections of the users of the domain.
 
 use std::sync::Arc;
 
 use bytes::BytesMut;
-use fipa_transport::log_limit;
+use fipa_transport::{DomainUsers, log_limit};
 use tokio::net::{UnixListener, UnixStream};
 
 use super::directory::peer;
@@ -17,18 +17,18 @@ use crate::stream::source::Source;
 use crate::stream::wire;
 
 /// Accepts connections until it is aborted.
-pub(super) async fn accept(endpoint: Arc<Endpoint>, listener: UnixListener) {
+pub(super) async fn accept(endpoint: Arc<Endpoint>, listener: UnixListener, users: DomainUsers) {
     loop {
         match listener.accept().await {
-            Ok((stream, _)) => serve(&endpoint, stream),
+            Ok((stream, _)) => serve(&endpoint, stream, users),
             Err(error) => endpoint.accept_failed(&error).await,
         }
     }
 }
 
 /// Starts the task of an accepted connection.
-fn serve(endpoint: &Arc<Endpoint>, stream: UnixStream) {
-    let from = match peer(&stream) {
+fn serve(endpoint: &Arc<Endpoint>, stream: UnixStream, users: DomainUsers) {
+    let from = match peer(&stream, users) {
         Ok(number) => Source::Process(number),
         Err(error) => {
             count(&endpoint.tally().refused_unproved);

@@ -1,4 +1,4 @@
-//! The socket files of a domain, in a directory that only this user may enter.
+//! The socket files of a domain, in a directory that only its users may enter.
 //!
 //! Every process has one socket, named after its incarnation. Files are used relative to the
 //! directory's descriptor, so that what was checked is what is used; `bind` and `connect` take them
@@ -6,15 +6,13 @@
 //! 108 bytes of a socket's address (unix(7)). Abstract addresses are not used: they have no
 //! permissions.
 
-use std::fs::DirBuilder;
 use std::io;
 use std::os::fd::{AsRawFd as _, OwnedFd};
-use std::os::unix::fs::DirBuilderExt as _;
 use std::os::unix::net::{UnixListener, UnixStream as StdStream};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use fipa_transport::Incarnation;
+use fipa_transport::{DirectoryError, DomainUsers, Incarnation};
 use rustix::fs::{AtFlags, Dir, FileType, FlockOperation, Mode, OFlags, Stat};
 use rustix::io::Errno;
 use rustix::net::{
@@ -39,21 +37,16 @@ pub enum UnixError {
     /// An operation of the operating system failed.
     #[error("cannot {what} {}", path.display())]
     Io {
-        /// The operation, as a verb for the error text.
+        /// The operation, as a verb.
         what: &'static str,
         /// The directory of the sockets.
         path: PathBuf,
         /// The error of the operating system.
         source: io::Error,
     },
-    /// The directory is not private to this user.
-    #[error("{} must be a directory that only this user may enter, but {why}", path.display())]
-    NotPrivate {
-        /// The directory of the sockets.
-        path: PathBuf,
-        /// The violated requirement.
-        why: String,
-    },
+    /// The directory cannot be used.
+    #[error(transparent)]
+    Directory(#[from] DirectoryError),
 }
 
 /// The identity of a file, independent of its name.
@@ -77,6 +70,7 @@ impl FileId {
 pub(super) struct Directory {
     path: PathBuf,
     dir: OwnedFd,
+    users: DomainUsers,
 }
 
 /// The lock of the directory. Dropping it unlocks the directory.
@@ -84,41 +78,11 @@ struct Locked(#[expect(dead_code, reason = "closing it unlocks")] OwnedFd);
 
 impl Directory {
     /// Opens the directory, and creates it if it is missing.
-    pub(super) fn open(path: &Path) -> Result<Self, UnixError> {
-        let io_error = |what, source| UnixError::Io {
-            what,
-            path: path.to_owned(),
-            source,
-        };
-        match DirBuilder::new().mode(0o700).create(path) {
-            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
-                return Err(io_error("create", error));
-            }
-            // An existing entry is checked next.
-            _ => {}
-        }
-        let refused = |why: String| UnixError::NotPrivate {
-            path: path.to_owned(),
-            why,
-        };
-        let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
-        let dir = match rustix::fs::open(path, flags, Mode::empty()) {
-            Ok(dir) => dir,
-            Err(Errno::LOOP | Errno::NOTDIR) => {
-                return Err(refused("it is a link or a file".into()));
-            }
-            Err(error) => return Err(io_error("open", error.into())),
-        };
-        let stat = rustix::fs::fstat(&dir).map_err(|error| io_error("examine", error.into()))?;
-        if stat.st_uid != rustix::process::geteuid().as_raw() {
-            return Err(refused(format!("it belongs to user {}", stat.st_uid)));
-        }
-        if stat.st_mode & 0o077 != 0 {
-            return Err(refused(format!("its mode is {:03o}", stat.st_mode & 0o777)));
-        }
+    pub(super) fn open(path: &Path, users: DomainUsers) -> Result<Self, UnixError> {
         Ok(Self {
+            dir: users.create_directory(path)?,
             path: path.to_owned(),
-            dir,
+            users,
         })
     }
 
@@ -131,7 +95,7 @@ impl Directory {
         }
     }
 
-    /// Creates a listening, non-blocking socket with this name that only this user may connect to.
+    /// Creates a listening, non-blocking socket with this name, to which only the users of the domain may connect.
     pub(super) fn bind(&self, name: &str) -> Result<(UnixListener, FileId), UnixError> {
         let make = || {
             // The file is there a moment before the kernel finds the socket by it; a sweep must not
@@ -143,12 +107,11 @@ impl Directory {
             let path = format!("/proc/self/fd/{}/{name}", self.dir.as_raw_fd());
             bind(&socket, &SocketAddrUnix::new(path)?)?;
             let stat = rustix::fs::statat(&self.dir, name, AtFlags::SYMLINK_NOFOLLOW)?;
-            let private = Mode::RUSR | Mode::WUSR;
-            rustix::fs::chmodat(&self.dir, name, private, AtFlags::empty())?;
+            self.users.share_socket(&self.dir, name)?;
             listen(&socket, BACKLOG)?;
             Ok((socket.into(), FileId::of(&stat)))
         };
-        make().map_err(|error: Errno| self.failed("create a socket in", error.into()))
+        make().map_err(|error: io::Error| self.failed("create a socket in", error))
     }
 
     /// Connects to the socket with this name. Returns the connection and the number of the process
@@ -163,10 +126,8 @@ impl Directory {
         let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let file = rustix::fs::openat(&self.dir, name, flags, Mode::empty())?;
         let stat = rustix::fs::fstat(&file)?;
-        if FileType::from_raw_mode(stat.st_mode) != FileType::Socket
-            || stat.st_uid != rustix::process::geteuid().as_raw()
-        {
-            let what = "the file is not a socket of this user";
+        if FileType::from_raw_mode(stat.st_mode) != FileType::Socket || !self.users.own(&stat) {
+            let what = "the file is not a socket of the users of this domain";
             return Err(io::Error::new(io::ErrorKind::PermissionDenied, what));
         }
         let address = SocketAddrUnix::new(format!("/proc/self/fd/{}", file.as_raw_fd()))?;
@@ -181,7 +142,7 @@ impl Directory {
             }
         }
         let stream = UnixStream::from_std(StdStream::from(socket))?;
-        let number = peer(&stream)?;
+        let number = peer(&stream, self.users)?;
         Ok((stream, number))
     }
 
@@ -267,12 +228,12 @@ impl Directory {
 /// Returns the process number of the peer, which is 0 when it is in another PID namespace.
 ///
 /// # Errors
-/// When the peer belongs to another user, or the system does not report it.
-pub(super) fn peer(stream: &UnixStream) -> io::Result<i32> {
+/// When the peer belongs to a user that is not one of these, or the system does not report it.
+pub(super) fn peer(stream: &UnixStream, users: DomainUsers) -> io::Result<i32> {
     let peer = stream.peer_cred()?;
-    let own = rustix::process::geteuid().as_raw();
     let number = peer.pid().unwrap_or_default();
-    if peer.uid() != own {
+    if !users.admit(peer.uid()) {
+        let own = rustix::process::geteuid().as_raw();
         let user = peer.uid();
         let what = format!(
             "process {number} belongs to user {user}, but this process belongs to user {own}"

@@ -19,8 +19,8 @@ use std::time::Duration;
 
 use fipa_acl::ErrorChain;
 use fipa_transport::{
-    Abandoned, Answer, AttemptId, Kind, ListenError, Location, OwnerProcess, Parcel, Sink, Ticket,
-    Transport, TransportError, log_limit, threads,
+    Abandoned, Answer, AttemptId, DirectoryError, DomainUsers, Kind, ListenError, Location,
+    OwnerProcess, Parcel, Sink, Ticket, Transport, TransportError, log_limit, threads,
 };
 use parking_lot::Mutex;
 use tokio::net::UnixListener;
@@ -45,19 +45,21 @@ const RETRIES: u32 = 20;
 /// Configuration of a [`UnixTransport`].
 #[derive(Debug, Clone)]
 pub struct UnixConfig {
-    /// The directory of the domain's sockets, private to this user. Created when it is missing, in
-    /// a directory that exists. Its path may be longer than the address of a socket.
+    /// The directory of the domain's sockets, which only the users of the domain may enter. Created when it is
+    /// missing, in a directory that exists. Its path may be longer than the address of a socket.
     pub directory: PathBuf,
+    /// The users of the domain.
+    pub users: DomainUsers,
     /// Identity of this endpoint. Its socket is named after the incarnation.
     pub identity: Identity,
     /// NetLimits and timeouts.
     pub limits: NetLimits,
 }
 
-/// Carries parcels over Unix domain sockets between processes of one user on one host.
+/// Carries parcels over Unix domain sockets between processes of one domain on one host.
 ///
 /// An address is the incarnation of the service, 16 hexadecimal digits: the name of its socket in
-/// the directory of the domain. Both sides check that the peer belongs to the same user
+/// the directory of the domain. Both sides check that the peer belongs to a user of the domain
 /// (`SO_PEERCRED`). Connections are kept, shared and closed as those of TCP.
 ///
 /// Dropping it closes it and removes the socket. After [`close`](Transport::close) the threads of
@@ -65,6 +67,7 @@ pub struct UnixConfig {
 #[derive(Debug)]
 pub struct UnixTransport {
     path: PathBuf,
+    users: DomainUsers,
     endpoint: Arc<Endpoint>,
     /// The socket, while the endpoint listens.
     bound: Arc<Mutex<Option<Bound>>>,
@@ -88,12 +91,14 @@ impl UnixTransport {
     pub fn new(config: UnixConfig, runtime: Handle) -> Self {
         let UnixConfig {
             directory,
+            users,
             identity,
             limits,
         } = config;
         let config = StreamConfig::new(identity, limits);
         Self {
             path: directory,
+            users,
             endpoint: Endpoint::new(Kind::Unix, config, runtime),
             bound: Arc::default(),
             closed: AtomicBool::new(false),
@@ -165,7 +170,7 @@ impl UnixTransport {
             .map_err(|source| bound.directory.failed("use a socket in", source))?;
         *self.bound.lock() = Some(bound);
         self.endpoint.replace_listener(|| {
-            let accept = accept::accept(self.endpoint.clone(), listener);
+            let accept = accept::accept(self.endpoint.clone(), listener, self.users);
             self.endpoint.runtime.spawn(accept)
         });
         Ok(true)
@@ -179,7 +184,7 @@ impl UnixTransport {
     fn bind(&self) -> Result<(StdListener, Bound), UnixError> {
         let name = self.name();
         let bind = || {
-            let directory = Directory::open(&self.path)?;
+            let directory = Directory::open(&self.path, self.users)?;
             let (listener, file) = directory.bind(&name)?;
             let directory = Arc::new(directory);
             Ok((listener, Bound { directory, file }))
@@ -188,11 +193,10 @@ impl UnixTransport {
         for _ in 0..RETRIES {
             match &bound {
                 // The last process has ended meanwhile and removed the directory.
-                Err(UnixError::Io { source, .. })
-                    if source.kind() == std::io::ErrorKind::NotFound =>
-                {
-                    bound = bind();
-                }
+                Err(
+                    UnixError::Io { source, .. }
+                    | UnixError::Directory(DirectoryError::Io { source, .. }),
+                ) if source.kind() == std::io::ErrorKind::NotFound => bound = bind(),
                 _ => break,
             }
         }
@@ -225,7 +229,7 @@ impl Transport for UnixTransport {
             Ok((listener, self.name()))
         };
         self.endpoint.listen_at(sink, open, |listener| {
-            runtime.spawn(accept::accept(self.endpoint.clone(), listener))
+            runtime.spawn(accept::accept(self.endpoint.clone(), listener, self.users))
         })
     }
 

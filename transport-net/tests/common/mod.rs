@@ -106,6 +106,7 @@ pub(crate) fn udt_config(listen: &[&str]) -> fipa_transport_net::UdtConfig {
 /// The configuration of an endpoint whose socket is in this directory.
 pub(crate) fn unix_config(directory: &Path) -> UnixConfig {
     UnixConfig {
+        users: fipa_transport::DomainUsers::This,
         directory: directory.to_owned(),
         identity: identity(),
         limits: config(&[]).limits,
