@@ -67,6 +67,7 @@ impl Access {
     ) -> bool {
         let facts = LetterFacts {
             sender,
+            user: None,
             receiver,
             performative,
             protocol,

@@ -12,8 +12,11 @@ pub struct Link {
     /// The kind of transport.
     pub via: Kind,
     /// The service at its other end, as it introduced itself on this link; unknown for a legacy
-    /// peer. Only on a [host-local](Kind::is_host_local) link is that a process of this user.
+    /// peer. Only on a [host-local](Kind::is_host_local) link is that a process of this domain and host.
     pub service: Incarnation,
+    /// The user of the process at its other end. `None` if that is the user of this process, or the process is on
+    /// another host.
+    pub user: Option<u32>,
     /// The party that sent the letter, as far as the link proves it.
     pub source: LetterSource,
 }
@@ -22,7 +25,7 @@ pub struct Link {
 /// source, and ignore the names in the letters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum LetterSource {
-    /// The service with this incarnation in a process of this user on this host.
+    /// The service with this incarnation in a process of this domain on this host.
     Process(Incarnation),
     /// The services with the key of the certificate with this SHA-256 fingerprint.
     Certificate([u8; 32]),
@@ -36,7 +39,7 @@ impl LetterSource {
     #[must_use]
     pub fn of(hop: &Hop) -> Self {
         match hop.principal {
-            Principal::Host => Self::Process(hop.location.incarnation()),
+            Principal::Host | Principal::User(_) => Self::Process(hop.location.incarnation()),
             Principal::Certificate(fingerprint) => Self::Certificate(fingerprint),
             Principal::Unproved => Self::unproved(&hop.location),
         }

@@ -8,12 +8,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use fipa_acl::{EnvelopeView, Letter, MessageView};
-use fipa_mts::{AccessGate, LetterParts, Link};
+use fipa_mts::{AccessGate, LetterParts, LetterSource, Link};
 use fipa_sds::{Directory, Entry, HostDirectory, Role as EntryRole};
-use fipa_transport::log_limit;
+use fipa_transport::{DomainUsers, log_limit};
 use parking_lot::Mutex;
 
 use crate::access::rules::{Access, LetterFacts, Refusal};
+use crate::domain::accounts::user_name;
 
 /// Log target of the lines about refused letters.
 const AUDIT: &str = "fipa::audit";
@@ -22,6 +23,7 @@ const AUDIT: &str = "fipa::audit";
 pub(crate) struct RulesGate {
     access: Mutex<Access>,
     of: Of,
+    host: Arc<HostDirectory>,
     is_active: AtomicBool,
     /// Whether a rule names an action, so that contents are read.
     #[cfg(feature = "actions")]
@@ -33,19 +35,20 @@ pub(crate) enum Of {
     /// The gateway with this name. Every sender may send letters to the gateway itself, because
     /// gateways and their agents communicate this way.
     Gateway(Arc<str>),
-    /// A process of this host, with its directory. The gateway of the host is identified by its
+    /// Another process. The gateway of the host is identified by its
     /// link. It may send its own letters to every agent, because they are answers only. The letters
     /// that it forwards are not counted again, because it has counted them.
-    Process(Arc<HostDirectory>),
+    Process,
 }
 
 impl RulesGate {
     /// Creates a gate without rules.
-    pub(crate) fn new(of: Of) -> Self {
+    pub(crate) fn new(of: Of, host: Arc<HostDirectory>) -> Self {
         Self {
             access: Mutex::default(),
+            is_active: AtomicBool::new(is_shared(&host)),
             of,
-            is_active: AtomicBool::new(false),
+            host,
             #[cfg(feature = "actions")]
             names_actions: AtomicBool::new(false),
         }
@@ -53,7 +56,7 @@ impl RulesGate {
 
     /// Replaces the rules. The rates of senders are counted from the beginning.
     pub(crate) fn set_rules(&self, rules: Option<Access>) {
-        let is_active = rules.is_some();
+        let is_active = rules.is_some() || is_shared(&self.host);
         let rules = rules.unwrap_or_default();
         // A letter that was read before has no action, so it is judged like one that is no goal.
         #[cfg(feature = "actions")]
@@ -98,8 +101,11 @@ impl RulesGate {
             return Err(Refused::Other(fault.clone()));
         }
         let sender = &*letter.sender;
+        let gateway = self.gateway_on(link);
         let facts = LetterFacts {
             sender,
+            // The user of the gateway has only passed on a letter of another host.
+            user: user_at(link).filter(|_| gateway.is_none()),
             receiver,
             performative: &letter.performative,
             protocol: letter.protocol.as_deref(),
@@ -117,7 +123,6 @@ impl RulesGate {
                     .and_then(|()| access.count(link.source, sender, now))
             }
         };
-        let gateway = self.gateway_on(link);
         let is_known = gateway.is_some();
         judge(gateway).or_else(|refusal| {
             // The gateway may have registered a moment ago. The directory is refreshed only for
@@ -153,27 +158,58 @@ impl RulesGate {
 
     /// Returns the entry of the gateway of this host if the directory shows the gateway at the
     /// other end of this link. The link must be within the host: only there does the kernel prove
-    /// that the other end is a process of this user.
+    /// that the other end is a process of a user of this domain.
     fn gateway_on(&self, link: Link) -> Option<Arc<Entry>> {
-        let Of::Process(host) = &self.of else {
-            return None;
-        };
-        if !link.via.is_host_local() {
+        if !matches!(self.of, Of::Process) || !link.via.is_host_local() {
             return None;
         }
-        let entry = host.known_incarnation(link.service)?;
-        (entry.role == EntryRole::Gateway).then_some(entry)
+        let entry = self.host.known_incarnation(link.service)?;
+        let is_gateway = entry.role == EntryRole::Gateway;
+        // The service at the other end of a link only claims its incarnation, also to other users.
+        let is_proved = !is_shared(&self.host) || self.host.user_of(&entry.name) == user_at(link);
+        (is_gateway && is_proved).then_some(entry)
+    }
+
+    /// Checks that a process of this host sends no letter in the name of an agent of another user.
+    fn check_user(&self, sender: &str, link: Link) -> Result<(), Refused> {
+        let Some(user) = user_at(link).filter(|_| is_shared(&self.host)) else {
+            return Ok(());
+        };
+        let other = || self.host.user_of(sender).filter(|owner| *owner != user);
+        if other().is_none() || self.gateway_on(link).is_some() {
+            return Ok(());
+        }
+        // The agent may have moved to a process of this user a moment ago.
+        self.host.refresh();
+        match other() {
+            None => Ok(()),
+            Some(owner) => Err(Refused::Other(format!(
+                "{sender} is an agent of {}, but a process of {} has sent the letter",
+                user_name(owner),
+                user_name(user)
+            ))),
+        }
     }
 
     /// Like [`gateway_on`](Self::gateway_on), after a refresh of the directory.
     fn refreshed_gateway_on(&self, link: Link) -> Option<Arc<Entry>> {
-        if let Of::Process(host) = &self.of
-            && link.via.is_host_local()
-        {
-            host.refresh();
+        if matches!(self.of, Of::Process) && link.via.is_host_local() {
+            self.host.refresh();
         }
         self.gateway_on(link)
     }
+}
+
+/// Whether the domain has several users.
+fn is_shared(host: &HostDirectory) -> bool {
+    host.users() != DomainUsers::This
+}
+
+/// Returns the user of the process at the other end of a link within this host.
+fn user_at(link: Link) -> Option<u32> {
+    let this = || rustix::process::geteuid().as_raw();
+    let is_process = matches!(link.source, LetterSource::Process(_));
+    (link.via.is_host_local() && is_process).then(|| link.user.unwrap_or_else(this))
 }
 
 /// The reason why a letter is refused.
@@ -221,12 +257,12 @@ impl AccessGate for RulesGate {
         letter: &LetterParts,
         link: Link,
     ) -> Result<(), String> {
-        if let Of::Gateway(own) = &self.of
-            && receiver == &**own
-        {
-            return Ok(());
-        }
-        let judged = self.judge(now, receiver, letter, link);
+        let judged = self
+            .check_user(&letter.sender, link)
+            .and_then(|()| match &self.of {
+                Of::Gateway(own) if receiver == &**own => Ok(()),
+                _ => self.judge(now, receiver, letter, link),
+            });
         judged.map_err(|why| {
             let sender = &*letter.sender;
             log_limit::warn!(target: AUDIT, of: link.source, sender, receiver, "letter refused: {why}");
@@ -274,11 +310,18 @@ mod tests {
     /// directory of both. The gate accepts one letter per second from each sender, and none from
     /// the denied senders.
     fn gate(denied: &[&str]) -> (RulesGate, HostDirectory, tempfile::TempDir) {
+        gate_for(DomainUsers::This, denied)
+    }
+
+    fn gate_for(
+        users: DomainUsers,
+        denied: &[&str],
+    ) -> (RulesGate, HostDirectory, tempfile::TempDir) {
         let place = tempfile::tempdir().unwrap();
         let open = |gateway| {
             let directory = HostDirectory::open(HostConfig {
                 brief: false,
-                users: fipa_transport::DomainUsers::This,
+                users,
                 dir: place.path().join("domain"),
                 mts: MtsId::new("mts", Incarnation::random()),
                 gateway,
@@ -295,8 +338,8 @@ mod tests {
             ..config::Access::default()
         };
         let access = rules.rules().unwrap().unwrap();
-        let gate = RulesGate::new(Of::Process(Arc::new(open(false))));
-        assert!(!gate.is_active());
+        let gate = RulesGate::new(Of::Process, Arc::new(open(false)));
+        assert_eq!(gate.is_active(), users != DomainUsers::This);
         gate.set_rules(Some(access));
         assert!(gate.is_active());
         (gate, open(true), place)
@@ -317,6 +360,7 @@ mod tests {
         Link {
             via,
             service: GATEWAY,
+            user: None,
             source: source_by(via, GATEWAY),
         }
     }
@@ -327,6 +371,7 @@ mod tests {
         Link {
             via,
             service,
+            user: None,
             source: source_by(via, service),
         }
     }
@@ -339,9 +384,7 @@ mod tests {
             ..Registration::new("mts", GATEWAY, vec![at])
         };
         gateway.register(registration).unwrap();
-        if let Of::Process(host) = &gate.of {
-            host.refresh();
-        }
+        gate.host.refresh();
     }
 
     fn admits(gate: &RulesGate, now: Instant, letter: &Letter, link: Link) -> Result<(), String> {
@@ -408,5 +451,39 @@ mod tests {
             assert!(!taken("mts", false, process_by(local)), "by its name");
         }
         assert!(!taken("mts", false, gateway_by(Kind::Tcp)), "unproved");
+    }
+
+    #[tokio::test]
+    async fn a_process_of_another_user_sends_no_letter_in_the_name_of_an_agent_of_this_user() {
+        let group = DomainUsers::Group(rustix::process::getegid().as_raw());
+        let (gate, other, _place) = gate_for(group, &[]);
+        let at = "unix://0000000000000009#0000000000000009".parse().unwrap();
+        let rover = Registration::new("rover", Incarnation::from_u64(0x7), vec![at]);
+        other.register(rover).unwrap();
+        gate.host.refresh();
+        let by_user = |user, via| Link {
+            user,
+            ..process_by(via)
+        };
+        let sent = |sender: &str, link| {
+            admits(&gate, Instant::now(), &letter(sender, sender, false), link)
+        };
+        let another = rustix::process::geteuid().as_raw().wrapping_add(1);
+        let refusal = sent("rover", by_user(Some(another), Kind::Unix)).unwrap_err();
+        assert!(
+            refusal.starts_with("rover is an agent of user "),
+            "{refusal}"
+        );
+        sent("rover", by_user(None, Kind::Unix)).unwrap();
+        sent("crex", by_user(Some(another), Kind::Unix)).unwrap();
+        // The gateway of this user passes letters on, and another user cannot claim to be that gateway.
+        register(&other, &gate);
+        let gateway = gateway_by(Kind::Unix);
+        assert!(gate.gateway_on(gateway).is_some());
+        let claimed = Link {
+            user: Some(another),
+            ..gateway
+        };
+        assert!(gate.gateway_on(claimed).is_none());
     }
 }

@@ -2,8 +2,8 @@
 //! protocol, ontology and action, and the rate limit of senders.
 //!
 //! A deny rule takes precedence over all allow rules. If there are allow rules, a letter that
-//! matches none of them is refused. This module does no I/O: it takes the facts of a letter and
-//! `now`, and returns a decision.
+//! matches none of them is refused. A decision needs no I/O: it takes the facts of a letter and `now`. The numbers of
+//! users are looked up when a rule is parsed.
 //!
 //! Not in this module: the proof of a sender's identity (`fipa_transport_net::secure`).
 
@@ -15,6 +15,8 @@ use fipa_mts::LetterSource;
 use fipa_sds::Matcher;
 use fipa_transport::TokenBucket;
 
+use crate::domain::accounts::user_number;
+
 /// An entry of `access.allow` or `access.deny`: the sender and its receivers.
 pub(crate) type Line<'a> = (&'a str, &'a [String]);
 
@@ -23,10 +25,12 @@ pub(crate) type Line<'a> = (&'a str, &'a [String]);
 /// a source that invents names evicts its own senders only.
 const MAX_SENDERS: usize = 8192;
 
-/// The properties of a letter that the rules check. They are claims of the sender.
+/// The properties of a letter that the rules check. All except the user are claims of the sender.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LetterFacts<'a> {
     pub(crate) sender: &'a str,
+    /// The user of the process on this host that sent it, as the kernel names it; `None` if that is not known.
+    pub(crate) user: Option<u32>,
     pub(crate) receiver: &'a str,
     pub(crate) performative: &'a str,
     pub(crate) protocol: Option<&'a str>,
@@ -89,6 +93,8 @@ struct SourceSenders {
 struct Rule {
     sender: Matcher,
     receiver: Matcher,
+    /// The numbers of the users to which the rule applies; if empty, all.
+    users: Vec<u32>,
     /// The performatives to which the rule applies; if empty, all.
     performatives: Vec<String>,
     /// The protocols to which the rule applies; if empty, all.
@@ -262,7 +268,7 @@ fn is_over(since: Instant, now: Instant) -> bool {
 }
 
 impl Rule {
-    /// Parses `RECEIVER [performative=NAME,…] [protocol=NAME,…] [ontology=NAME,…] [action=NAME,…]`.
+    /// Parses `RECEIVER [user=NAME,…] [performative=NAME,…] [protocol=NAME,…] [ontology=NAME,…] [action=NAME,…]`.
     fn parse(sender: &str, receiver: &str) -> Result<Self, RuleError> {
         let mut words = receiver.split_whitespace();
         let name = words.next().unwrap_or_default();
@@ -272,6 +278,7 @@ impl Rule {
         let mut rule = Self {
             sender: matcher(sender)?,
             receiver: matcher(name)?,
+            users: Vec::new(),
             performatives: Vec::new(),
             protocols: Vec::new(),
             ontologies: Vec::new(),
@@ -279,6 +286,16 @@ impl Rule {
         };
         for word in words {
             let (list, names) = match word.split_once('=') {
+                Some(("user", names)) => {
+                    for name in names.split(',') {
+                        rule.users.push(user_number(name).ok_or_else(|| {
+                            RuleError(format!(
+                                "names the user {name:?}, which /etc/passwd does not list"
+                            ))
+                        })?);
+                    }
+                    continue;
+                }
                 Some(("performative", names)) => (&mut rule.performatives, names),
                 Some(("protocol", names)) => (&mut rule.protocols, names),
                 Some(("ontology", names)) => (&mut rule.ontologies, names),
@@ -305,6 +322,7 @@ impl Rule {
         };
         self.sender.matches(facts.sender)
             && self.receiver.matches(facts.receiver)
+            && (self.users.is_empty() || facts.user.is_some_and(|user| self.users.contains(&user)))
             && among(&self.performatives, Some(facts.performative))
             && among(&self.protocols, facts.protocol)
             && among(&self.ontologies, facts.ontology)
@@ -400,6 +418,7 @@ mod tests {
     fn facts<'a>(sender: &'a str, receiver: &'a str) -> LetterFacts<'a> {
         LetterFacts {
             sender,
+            user: None,
             receiver,
             performative: "inform",
             protocol: None,
@@ -451,6 +470,26 @@ mod tests {
             };
             assert_eq!(access.judge(&facts).is_ok(), passes, "{facts:?}");
         }
+    }
+
+    #[test]
+    fn a_rule_can_be_about_some_users_only() {
+        let access = access(&[], &[(".*", &["arm user=root,1001"])], 0);
+        for (user, passes) in [
+            (Some(0), true),
+            (Some(1001), true),
+            (Some(1002), false),
+            (None, false),
+        ] {
+            let facts = LetterFacts {
+                user,
+                ..facts("rover", "arm")
+            };
+            assert_eq!(access.judge(&facts).is_ok(), passes, "{facts:?}");
+        }
+        let receivers = ["arm user=no-such-user".to_owned()];
+        let why = fault(("rover", &receivers)).unwrap().to_string();
+        assert!(why.contains("which /etc/passwd does not list"), "{why}");
     }
 
     #[test]

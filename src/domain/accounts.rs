@@ -24,6 +24,11 @@ fn named(kind: &str, lines: &str, number: u32) -> String {
     }
 }
 
+/// Returns the number of a user, who is given by name or number.
+pub(crate) fn user_number(user: &str) -> Option<u32> {
+    user.parse().ok().or_else(|| number_in(&users(), user))
+}
+
 /// Returns the number of a group, which is given by its name or its number.
 pub(crate) fn group_number(group: &str) -> Option<u32> {
     group.parse().ok().or_else(|| number_in(&groups(), group))

@@ -712,40 +712,91 @@ mod tests {
             (&link, "a symbolic link"),
             (&file, "a file"),
         ] {
-            let error = make_private(path).unwrap_err().to_string();
+            let error = at(path.clone()).create().unwrap_err().to_string();
             assert!(error.contains(problem), "{error}");
         }
-        let fresh = home.path().join("fresh");
-        make_private(&fresh).unwrap();
-        make_private(&fresh).unwrap();
-        assert_eq!(fs::metadata(&fresh).unwrap().mode() & 0o777, 0o700);
+        let fresh = at(home.path().join("fresh"));
+        fresh.create().unwrap();
+        fresh.create().unwrap();
+        for level in fresh.levels() {
+            assert_eq!(fs::metadata(level).unwrap().mode() & 0o777, 0o700);
+        }
     }
 
     #[test]
     fn prefixes_differ_by_domain_and_base() {
         let dir = |base: &str, domain: &str| DomainDir {
-            base: base.into(),
-            name_held_by: None,
-            domain: domain.into(),
-            locks: None,
+            domain: domain.to_owned(),
+            ..at(base.into())
         };
         let all = [dir("/a", "x"), dir("/a", "y"), dir("/b", "x")].map(|p| p.prefix());
         assert!(all[0] != all[1] && all[0] != all[2] && all[1] != all[2]);
         assert!(dir("/a", &"d".repeat(32)).prefix().len() <= 47);
     }
 
-    /// Creates a domain directory in a temporary directory.
-    fn created() -> (tempfile::TempDir, DomainDir) {
-        let home = tempfile::tempdir().unwrap();
-        let dir = DomainDir {
-            base: home.path().join("base"),
+    /// The directory of a domain with this upper level.
+    fn at(base: PathBuf) -> DomainDir {
+        DomainDir {
+            base,
+            group: String::new(),
+            users: Some(DomainUsers::This),
+            is_named: true,
             name_held_by: None,
             domain: "domain".to_owned(),
             locks: None,
-        };
-        make_private(&dir.base).unwrap();
-        make_private(&dir.path()).unwrap();
+        }
+    }
+
+    /// Creates a domain directory in a temporary directory.
+    fn created() -> (tempfile::TempDir, DomainDir) {
+        let home = tempfile::tempdir().unwrap();
+        let dir = at(home.path().join("base"));
+        dir.create().unwrap();
         (home, dir)
+    }
+
+    #[test]
+    fn a_group_needs_to_exist_and_a_directory() {
+        let config = |group: &str, runtime_dir: &str| Config {
+            group: group.to_owned(),
+            runtime_dir: runtime_dir.to_owned(),
+            ..Config::default()
+        };
+        let error = |config| DomainDir::of(&config).users().unwrap_err().to_string();
+        let unknown = error(config("no such group", "/run/fipa"));
+        assert!(unknown.contains("/etc/group does not list it"), "{unknown}");
+        let homeless = error(config("4711", ""));
+        assert!(homeless.contains("install -d -g 4711 -m 770"), "{homeless}");
+        let users = DomainDir::of(&config("4711", "/run/fipa")).users();
+        assert_eq!(users.unwrap(), DomainUsers::Group(4711));
+    }
+
+    #[test]
+    fn a_private_upper_level_is_opened_to_its_own_group_only() {
+        let group = rustix::process::getegid().as_raw();
+        let home = tempfile::tempdir().unwrap();
+        let shared = |group: u32| DomainDir {
+            group: group.to_string(),
+            users: Some(DomainUsers::Group(group)),
+            ..at(home.path().join("base"))
+        };
+        fs::create_dir(home.path().join("base")).unwrap();
+        fs::set_permissions(home.path().join("base"), fs::Permissions::from_mode(0o700)).unwrap();
+        let error = shared(group.wrapping_add(1))
+            .create()
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("chmod 770"), "{error}");
+        let dir = shared(group);
+        dir.create().unwrap();
+        for level in dir.levels() {
+            let found = fs::metadata(level).unwrap();
+            assert_eq!((found.mode() & 0o777, found.gid()), (0o770, group));
+        }
+        assert!(dir.exists().unwrap());
+        fs::set_permissions(&dir.base, fs::Permissions::from_mode(0o775)).unwrap();
+        let error = dir.exists().unwrap_err().to_string();
+        assert!(error.contains("its mode is 775"), "{error}");
     }
 
     fn is_locked(path: &Path) -> bool {
@@ -781,7 +832,8 @@ mod tests {
     fn the_remedy_names_the_mode_or_the_user() {
         let home = tempfile::tempdir().unwrap();
         fs::set_permissions(home.path(), fs::Permissions::from_mode(0o755)).unwrap();
-        let error = check_private(home.path()).unwrap_err().to_string();
+        let dir = at(home.path().to_owned());
+        let error = dir.check(home.path()).unwrap_err().to_string();
         let remedy = format!("chmod 700 {}", home.path().display());
         assert!(error.contains(&remedy), "{error}");
         assert!(error.contains("RuntimeDirectoryMode=0700"), "{error}");

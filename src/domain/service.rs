@@ -380,9 +380,9 @@ fn gate(
 ) -> Result<Arc<RulesGate>, OpenError> {
     let of = match role.gateway {
         true => Of::Gateway(Arc::clone(&role.name)),
-        false => Of::Process(Arc::clone(host)),
+        false => Of::Process,
     };
-    let gate = RulesGate::new(of);
+    let gate = RulesGate::new(of, Arc::clone(host));
     // Cannot fail, because the check of the configuration has parsed the rules.
     gate.set_rules(config.access.rules().map_err(OpenError::Access)?);
     Ok(Arc::new(gate))

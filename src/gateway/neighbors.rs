@@ -61,7 +61,7 @@ impl Disconnected {
     fn is_back_as(&self, neighbor: &Neighbor) -> bool {
         let is_same = match self.principal {
             Principal::Certificate(_) => self.principal == neighbor.principal,
-            Principal::Host | Principal::Unproved => true,
+            Principal::Host | Principal::User(_) | Principal::Unproved => true,
         };
         is_same && self.entry.name == neighbor.entry.name
     }
@@ -135,7 +135,7 @@ fn security(principal: Principal) -> LinkSecurity {
             encrypted: true,
             certificate: Some(hex(fingerprint)),
         },
-        Principal::Host | Principal::Unproved => LinkSecurity::default(),
+        Principal::Host | Principal::User(_) | Principal::Unproved => LinkSecurity::default(),
     }
 }
 

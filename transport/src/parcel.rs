@@ -26,7 +26,7 @@ impl Realm {
             Principal::Certificate([a, b, c, d, e, f, g, h, ..]) => {
                 Self(u64::from_le_bytes([*a, *b, *c, *d, *e, *f, *g, *h]).max(1))
             }
-            Principal::Host | Principal::Unproved => Self::UNPROVED,
+            Principal::Host | Principal::User(_) | Principal::Unproved => Self::UNPROVED,
         }
     }
 

@@ -27,7 +27,7 @@ impl PeerId {
     #[must_use]
     pub fn of(principal: Principal, location: Option<&Location>) -> Self {
         match principal {
-            Principal::Host => Self::THIS_HOST,
+            Principal::Host | Principal::User(_) => Self::THIS_HOST,
             Principal::Certificate(fingerprint) => Self(Some(hex(&fingerprint).into())),
             Principal::Unproved => location.map_or_else(Self::unknown, Self::at),
         }

@@ -309,7 +309,7 @@ impl Hop {
     /// Whether the service may be on another host. False only if the link proves that it is not.
     #[must_use]
     pub fn is_remote(&self) -> bool {
-        self.principal != Principal::Host
+        !matches!(self.principal, Principal::Host | Principal::User(_))
     }
 }
 

@@ -271,3 +271,107 @@ fn io_error(what: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Direct
 fn this_user() -> u32 {
     rustix::process::geteuid().as_raw()
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs::{self, Permissions};
+    use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, symlink};
+    use std::os::unix::net::UnixListener;
+
+    use super::*;
+
+    fn this_group() -> u32 {
+        rustix::process::getegid().as_raw()
+    }
+
+    fn mode(path: &Path) -> u32 {
+        fs::symlink_metadata(path).unwrap().mode() & 0o7777
+    }
+
+    #[test]
+    fn directories_and_files_are_open_to_their_users_only() {
+        let home = tempfile::tempdir().unwrap();
+        for (users, name, modes) in [
+            (DomainUsers::This, "own", (0o700, 0o600)),
+            (DomainUsers::Group(this_group()), "shared", (0o770, 0o660)),
+        ] {
+            let path = home.path().join(name);
+            let directory = users.create_directory(&path).unwrap();
+            users.create_directory(&path).unwrap();
+            users.create_file(&directory, "file").unwrap();
+            let error = users.create_file(&directory, "file").unwrap_err();
+            assert_eq!(error.kind(), io::ErrorKind::AlreadyExists);
+            let _listener = UnixListener::bind(path.join("socket")).unwrap();
+            users.share_socket(&directory, "socket").unwrap();
+            assert_eq!((mode(&path), mode(&path.join("file"))), modes);
+            assert_eq!(mode(&path.join("socket")), modes.1);
+            let found = rustix::fs::statat(&directory, "file", AtFlags::empty()).unwrap();
+            assert!(users.own(&found));
+        }
+        // Nothing unfinished is left.
+        assert_eq!(fs::read_dir(home.path()).unwrap().count(), 2);
+    }
+
+    #[test]
+    fn a_directory_that_others_could_enter_is_refused() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("directory");
+        let link = home.path().join("link");
+        symlink(home.path(), &link).unwrap();
+        fs::write(home.path().join("file"), "").unwrap();
+        fs::create_dir(&path).unwrap();
+        let group = this_group();
+        let shared = DomainUsers::Group(group);
+        let refused = |users: DomainUsers, path: &Path| match users.create_directory(path) {
+            Err(DirectoryError::NotPrivate { intrusion, .. }) => intrusion,
+            other => panic!("{other:?}"),
+        };
+        for users in [DomainUsers::This, shared] {
+            fs::set_permissions(&path, Permissions::from_mode(0o771)).unwrap();
+            assert_eq!(refused(users, &path), Intrusion::Mode(0o771));
+            assert_eq!(refused(users, &link), Intrusion::NoDirectory);
+            assert_eq!(
+                refused(users, &home.path().join("file")),
+                Intrusion::NoDirectory
+            );
+        }
+        fs::set_permissions(&path, Permissions::from_mode(0o770)).unwrap();
+        assert_eq!(refused(DomainUsers::This, &path), Intrusion::Mode(0o770));
+        let expected = group.wrapping_add(1);
+        let other = DomainUsers::Group(expected);
+        let found = group;
+        assert_eq!(refused(other, &path), Intrusion::Group { found, expected });
+        shared.create_directory(&path).unwrap();
+    }
+
+    #[test]
+    fn a_private_directory_is_opened_to_the_group_that_it_has() {
+        let home = tempfile::tempdir().unwrap();
+        let opened = |before: u32, users: DomainUsers| {
+            fs::set_permissions(home.path(), Permissions::from_mode(before)).unwrap();
+            users.open_to_group(home.path()).unwrap();
+            mode(home.path())
+        };
+        let group = this_group();
+        assert_eq!(opened(0o700, DomainUsers::This), 0o700);
+        assert_eq!(
+            opened(0o700, DomainUsers::Group(group.wrapping_add(1))),
+            0o700
+        );
+        assert_eq!(opened(0o755, DomainUsers::Group(group)), 0o755);
+        assert_eq!(opened(0o700, DomainUsers::Group(group)), 0o770);
+    }
+
+    #[test]
+    fn a_link_in_the_place_of_a_socket_opens_no_file() {
+        let home = tempfile::tempdir().unwrap();
+        let users = DomainUsers::Group(this_group());
+        let directory = users.create_directory(&home.path().join("shared")).unwrap();
+        let key = home.path().join("key");
+        fs::write(&key, "").unwrap();
+        fs::set_permissions(&key, Permissions::from_mode(0o600)).unwrap();
+        symlink(&key, home.path().join("shared/socket")).unwrap();
+        users.share_socket(&directory, "socket").unwrap_err();
+        assert_eq!(mode(&key), 0o600);
+    }
+}

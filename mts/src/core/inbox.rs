@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::Letter;
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Location, PeerId, Realm, Stream,
+    Answer, FailureReason, Hop, Incarnation, Kind, Location, PeerId, Principal, Realm, Stream,
 };
 
 use super::label::Label;
@@ -317,6 +317,10 @@ pub(super) fn link_of(via: Kind, from: &Hop) -> Link {
     Link {
         via,
         service: from.location.incarnation(),
+        user: match from.principal {
+            Principal::User(user) => Some(user),
+            _ => None,
+        },
         source: LetterSource::of(from),
     }
 }
@@ -375,7 +379,7 @@ mod tests {
     fn back() -> Hop {
         Hop {
             location: "shm://1#0000000000000001".parse().unwrap(),
-            principal: fipa_transport::Principal::Host,
+            principal: Principal::Host,
         }
     }
 

@@ -150,7 +150,7 @@ impl Principals {
         let services = self.services.iter().map(|(it, service)| (*it, service));
         let untrusted = services.filter(|(_, service)| match &service.principal {
             Principal::Certificate(certificate) => !is_trusted(certificate),
-            Principal::Host | Principal::Unproved => false,
+            Principal::Host | Principal::User(_) | Principal::Unproved => false,
         });
         untrusted
             .map(|(it, service)| (it, service.principal))

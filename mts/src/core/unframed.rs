@@ -355,6 +355,7 @@ impl Core {
         let unproved = Link {
             via,
             service: Incarnation::UNKNOWN,
+            user: None,
             source: gate::LetterSource::at(from.address),
         };
         if let Err(why) = self.ask_gate(now, &entry.name, parts.as_ref(), unproved) {

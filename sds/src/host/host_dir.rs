@@ -481,7 +481,7 @@ impl HostDir {
         }
         Ok(Some(Content {
             bytes,
-            of_this_user: DomainUsers::This.own(&found),
+            user: found.st_uid,
         }))
     }
 
@@ -523,8 +523,8 @@ impl HostDir {
 /// The content of a file.
 pub(super) struct Content {
     pub(super) bytes: Vec<u8>,
-    /// Whether a process of this user has written it.
-    pub(super) of_this_user: bool,
+    /// The user whose process has written it.
+    pub(super) user: u32,
 }
 
 /// Number of changes whose files are remembered, and the bytes of each: its process, and the kind of the file.

@@ -218,6 +218,13 @@ impl HostDirectory {
         self.config.users
     }
 
+    /// Returns the user whose process on this host has registered an agent of this name, as the owner of its file
+    /// proves. `None` if there is none.
+    #[must_use]
+    pub fn user_of(&self, name: &str) -> Option<u32> {
+        self.shared.user_of(name)
+    }
+
     /// Returns notifications of processes of this host that end, gracefully or not.
     #[must_use]
     pub fn departures(&self) -> Departures {

@@ -10,7 +10,7 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
 use super::file::{self, Entries, FileError};
-use super::host_dir::{Guard, HostDir, Id, Name, Version};
+use super::host_dir::{Content, Guard, HostDir, Id, Name, Version};
 use super::remote::{self, RemoteAgents, RemoteError, RemoteLists};
 use super::{Cancellation, HostError, SocketId};
 use crate::table::Table;
@@ -56,14 +56,20 @@ struct OtherProcesses {
 impl OtherProcesses {
     /// Whether another process has registered an agent of this name in a file that exists now.
     fn has_registered(&self, name: &str) -> bool {
-        self.processes
-            .values()
-            .any(|process| process.version.is_some() && process.entries.contains_key(name))
+        self.registrar(name).is_some()
+    }
+
+    /// Returns the process that has registered an agent of this name in a file that exists now.
+    fn registrar(&self, name: &str) -> Option<&Process> {
+        let mut processes = self.processes.values();
+        processes.find(|process| process.version.is_some() && process.entries.contains_key(name))
     }
 }
 
 #[derive(Debug, Default)]
 struct Process {
+    /// The owner of the file with the entries.
+    user: u32,
     version: Option<Version>,
     entries: Entries,
 }
@@ -118,6 +124,14 @@ impl Shared {
         Ok(host_dir.is_there()?
             && is_there(Name::Entries(id), own.agents.is_empty())?
             && is_there(Name::Remote(id), own.remote.is_empty())?)
+    }
+
+    /// Returns the user whose process on this host has registered an agent of this name.
+    pub(super) fn user_of(&self, name: &str) -> Option<u32> {
+        if self.own.lock().agents.contains_key(name) {
+            return Some(rustix::process::geteuid().as_raw());
+        }
+        Some(self.others.lock().registrar(name)?.user)
     }
 
     /// Joins the directory again after it, or files of this process in it, were removed; returns
@@ -287,20 +301,20 @@ impl Shared {
         if known.is_none() && !self.host_dir().is_running(id)? {
             return Ok(());
         }
-        let read = || -> Result<Entries, ReadError> {
-            match self.host_dir().read(name)? {
-                Some(content) => {
-                    let entries = file::read(&content.bytes)?;
-                    Ok(match content.of_this_user {
-                        true => entries,
-                        false => without_memory(entries),
-                    })
-                }
-                None => Ok(Entries::default()),
-            }
+        let this_user = rustix::process::geteuid().as_raw();
+        let read = || -> Result<(Entries, u32), ReadError> {
+            let Some(Content { bytes, user }) = self.host_dir().read(name)? else {
+                return Ok((Entries::default(), this_user));
+            };
+            let entries = file::read(&bytes)?;
+            Ok(match user == this_user {
+                true => (entries, user),
+                false => (without_memory(entries), user),
+            })
         };
-        let entries = read().unwrap_or_else(|error| self.ignored(name, &error));
+        let (entries, user) = read().unwrap_or_else(|error| self.ignored(name, &error));
         let process = others.processes.entry(id).or_default();
+        process.user = user;
         // Taken before reading, so that a replacement in between causes another read.
         process.version = version;
         let before = std::mem::replace(&mut process.entries, entries);

@@ -3,9 +3,11 @@
 use std::path::Path;
 
 use fipa_acl::ErrorChain;
+use fipa_transport::DomainUsers;
 
 use super::{Area, Check, Severity};
 use crate::Config;
+use crate::domain::accounts::group_name;
 use crate::domain::files::{DomainDir, DomainDirError};
 use crate::domain::user_dir::Holder;
 
@@ -49,7 +51,7 @@ fn directory(dir: &DomainDir) -> Check {
     let path = dir.path();
     match dir.exists() {
         Ok(true) => match dir.name_held_by() {
-            None => AREA.fine(CHECK, format!("{} is private", path.display())),
+            None => AREA.fine(CHECK, private(&dir)),
             Some(holder) => name_held(&path, holder),
         },
         Ok(false) => {
@@ -65,6 +67,21 @@ fn directory(dir: &DomainDir) -> Check {
             ErrorChain(&error).to_string(),
             "follow the remedy above; until then no process can join the domain",
         ),
+    }
+}
+
+/// Describes a directory that no other user can enter.
+fn private(dir: &DomainDir) -> String {
+    let path = dir.path();
+    match dir.users() {
+        Ok(DomainUsers::Group(group)) => {
+            format!(
+                "{} is shared by the members of {}",
+                path.display(),
+                group_name(group)
+            )
+        }
+        _ => format!("{} is private", path.display()),
     }
 }
 

@@ -762,6 +762,16 @@ mod tests {
             );
             assert!(!new.exists());
         }
+        // In a domain of a group, another user can put a link to a file of this user in the place of one.
+        let own = directory.path().join("own");
+        fs::write(&own, "own").unwrap();
+        std::os::unix::fs::symlink(&own, &new).unwrap();
+        replace(&path, &new, b"fourth").unwrap();
+        assert_eq!(fs::read(&own).unwrap(), b"own");
+        fs::remove_file(&path).unwrap();
+        std::os::unix::fs::symlink(&own, &path).unwrap();
+        super::read(&path).unwrap_err();
+        fs::remove_file(&path).unwrap();
         fs::write(&path, " ".repeat(MAX_BYTES + 10)).unwrap();
         assert_eq!(super::read(&path).unwrap().unwrap().len(), MAX_BYTES + 1);
     }

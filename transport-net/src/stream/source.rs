@@ -31,8 +31,13 @@ impl QuotaKey {
 /// The other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Source {
-    /// A process of this host and domain, by its process number (Unix domain socket).
-    Process(i32),
+    /// A process of this host and domain (Unix domain socket).
+    Process {
+        /// Its process number; 0 if it is in another PID namespace.
+        number: i32,
+        /// Its user, unless that is the user of this process.
+        other_user: Option<u32>,
+    },
     /// An address (TCP and QUIC).
     #[cfg(feature = "ip")]
     Address(SocketAddr),
@@ -51,7 +56,7 @@ pub(crate) enum Home {
 impl Source {
     pub(crate) fn home(self) -> Home {
         match self {
-            Self::Process(number) => Home::Process(number),
+            Self::Process { number, .. } => Home::Process(number),
             #[cfg(feature = "ip")]
             Self::Address(address) => Home::Address(address.ip()),
         }
@@ -72,7 +77,7 @@ impl Home {
 impl fmt::Display for Source {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Process(number) => write!(f, "process {number}"),
+            Self::Process { number, .. } => write!(f, "process {number}"),
             #[cfg(feature = "ip")]
             Self::Address(address) => address.fmt(f),
         }

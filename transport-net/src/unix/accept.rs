@@ -29,7 +29,7 @@ pub(super) async fn accept(endpoint: Arc<Endpoint>, listener: UnixListener, user
 /// Starts the task of an accepted connection.
 fn serve(endpoint: &Arc<Endpoint>, stream: UnixStream, users: DomainUsers) {
     let from = match peer(&stream, users) {
-        Ok(number) => Source::Process(number),
+        Ok(from) => from,
         Err(error) => {
             count(&endpoint.tally().refused_unproved);
             log_limit::warn!("connection refused: {error}");

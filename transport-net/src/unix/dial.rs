@@ -35,7 +35,7 @@ pub(super) async fn dial(
         connected = connect(&directory, to.address(), limits.connect_timeout) => connected,
         end = link.end_requested() => return running.fail(end),
     };
-    let (stream, number) = match connected {
+    let (stream, from) = match connected {
         Ok(connected) => connected,
         Err(error) => return running.fail(ConnectionEnd::unreachable(&to, &in_words(&error))),
     };
@@ -45,7 +45,6 @@ pub(super) async fn dial(
     };
     link.connected(Instant::now());
     let reader = FrameReader::new(limits.max_letter, BytesMut::new());
-    let from = Source::Process(number);
     running
         .serve(ends, Proof::default(), reader, from, || {})
         .await;
@@ -65,7 +64,7 @@ async fn connect(
     directory: &Directory,
     name: &str,
     timeout: Duration,
-) -> io::Result<(UnixStream, i32)> {
+) -> io::Result<(UnixStream, Source)> {
     match time::timeout(timeout, directory.connect(name)).await {
         Ok(connected) => connected,
         Err(_) => Err(io::Error::new(

@@ -21,6 +21,8 @@ use rustix::net::{
 use tokio::net::UnixStream;
 use tokio::time::sleep;
 
+use crate::stream::source::Source;
+
 /// Maximum number of connections that wait to be accepted.
 const BACKLOG: i32 = 1024;
 
@@ -114,9 +116,8 @@ impl Directory {
         make().map_err(|error: io::Error| self.failed("create a socket in", error))
     }
 
-    /// Connects to the socket with this name. Returns the connection and the number of the process
-    /// at its other end.
-    pub(super) async fn connect(&self, name: &str) -> io::Result<(UnixStream, i32)> {
+    /// Connects to the socket with this name. Returns the connection and the process at its other end.
+    pub(super) async fn connect(&self, name: &str) -> io::Result<(UnixStream, Source)> {
         if name.parse::<Incarnation>().is_err() {
             let what = "not the address of a Unix domain socket (16 hexadecimal digits expected)";
             return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
@@ -142,8 +143,8 @@ impl Directory {
             }
         }
         let stream = UnixStream::from_std(StdStream::from(socket))?;
-        let number = peer(&stream, self.users)?;
-        Ok((stream, number))
+        let from = peer(&stream, self.users)?;
+        Ok((stream, from))
     }
 
     /// Removes the sockets of dead processes, unless another process sweeps or creates its own
@@ -225,22 +226,25 @@ impl Directory {
     }
 }
 
-/// Returns the process number of the peer, which is 0 when it is in another PID namespace.
+/// Returns the process at the other end.
 ///
 /// # Errors
 /// When the peer belongs to a user that is not one of these, or the system does not report it.
-pub(super) fn peer(stream: &UnixStream, users: DomainUsers) -> io::Result<i32> {
+pub(super) fn peer(stream: &UnixStream, users: DomainUsers) -> io::Result<Source> {
     let peer = stream.peer_cred()?;
     let number = peer.pid().unwrap_or_default();
-    if !users.admit(peer.uid()) {
-        let own = rustix::process::geteuid().as_raw();
-        let user = peer.uid();
+    let own = rustix::process::geteuid().as_raw();
+    let user = peer.uid();
+    if !users.admit(user) {
         let what = format!(
             "process {number} belongs to user {user}, but this process belongs to user {own}"
         );
         return Err(io::Error::new(io::ErrorKind::PermissionDenied, what));
     }
-    Ok(number)
+    Ok(Source::Process {
+        number,
+        other_user: (user != own).then_some(user),
+    })
 }
 
 fn new_socket(kind: SocketType) -> rustix::io::Result<OwnedFd> {

@@ -857,7 +857,10 @@ impl Endpoint {
         }
         let (principal, back) = match from {
             // A process of this host is reached at the socket that is named after its incarnation.
-            Source::Process(_) => (Principal::Host, incarnation.to_string()),
+            Source::Process { other_user, .. } => (
+                other_user.map_or(Principal::Host, Principal::User),
+                incarnation.to_string(),
+            ),
             #[cfg(feature = "ip")]
             Source::Address(from) => (
                 self.config.principal_at(from.ip(), &peer.identity),
