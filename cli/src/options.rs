@@ -27,7 +27,7 @@ use crate::report::{self, Failure};
 /// Every command reads one configuration file: the file given with --config, else the file named by
 /// $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml, else /etc/fipa/fipa.toml. Without a file
 /// the defaults apply.
-/// A domain belongs to one user: processes of different users never share agents.
+/// A domain belongs to one user, or to the members of a group (key `group`).
 #[derive(Debug, Parser)]
 #[command(
     name = "fipa",

@@ -33,7 +33,7 @@
 //! states its safety argument; no other crate of this project contains `unsafe`.
 //!
 //! # Trust
-//! Processes of one domain run as one user, so each of them can already read and end the others.
+//! The processes that share memory run as one user, so each of them can already read and end the others.
 //! Even so, no memory that another process can still change is parsed: headers, names and envelopes
 //! are copied into private memory first. Only content is read in place; two reads of it give the
 //! same bytes only if the sender is honest. A process whose announcements are wrong makes another one

@@ -51,7 +51,7 @@ fn directory(dir: &DomainDir) -> Check {
     let path = dir.path();
     match dir.exists() {
         Ok(true) => match dir.name_held_by() {
-            None => AREA.fine(CHECK, private(&dir)),
+            None => AREA.fine(CHECK, private(dir)),
             Some(holder) => name_held(&path, holder),
         },
         Ok(false) => {

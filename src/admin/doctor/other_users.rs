@@ -1,4 +1,4 @@
-//! Looks for domains of other users on this machine. A domain belongs to one user, so their agents are
+//! Looks for domains of other users on this machine. A domain belongs to one user or to a group, so their agents are
 //! invisible to this user, which surprises when both domains have the same name.
 
 use std::collections::{BTreeMap, BTreeSet};

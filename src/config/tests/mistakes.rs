@@ -20,18 +20,18 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "deadline = \"5s\"\n",
             "fipa.toml:1: unknown key `deadline`; did you mean `mts.deadline`? \
-             (known at the top: domain, runtime_dir, mts, transport, discovery, security, contacts, access, monitor, \
+             (known at the top: domain, runtime_dir, group, mts, transport, discovery, security, contacts, access, monitor, \
              platform, routes)",
         ),
         (
             "[discover]\nmdns = true\n",
             "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
-             (known at the top: domain, runtime_dir, mts, transport, discovery, security, contacts, access, monitor, \
+             (known at the top: domain, runtime_dir, group, mts, transport, discovery, security, contacts, access, monitor, \
              platform, routes)",
         ),
         (
             "[radio]\nrate = 1\n",
-            "fipa.toml:1: unknown key `radio`; known at the top: domain, runtime_dir, mts, transport, discovery, \
+            "fipa.toml:1: unknown key `radio`; known at the top: domain, runtime_dir, group, mts, transport, discovery, \
              security, contacts, access, monitor, platform, routes",
         ),
         (

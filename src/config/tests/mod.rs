@@ -107,6 +107,7 @@ fn every_key_is_read() {
         r#"
         domain = "lab_2"
         runtime_dir = "/run/fipa"
+        group = "robot"
         mts = { name = "crex", transports = ["tcp"], deadline = "1m 30s", queue = 8 }
         [routes]
         "camera_.*" = ["shm", "tcp"]
@@ -151,6 +152,7 @@ fn every_key_is_read() {
     );
     assert_eq!(config.domain, "lab_2");
     assert_eq!(config.runtime_dir, "/run/fipa");
+    assert_eq!(config.group, "robot");
     assert_eq!(config.mts.name, "crex");
     assert_eq!(config.mts.transports, [Kind::Tcp]);
     assert_eq!(config.mts.deadline, Duration::from_secs(90));
@@ -433,6 +435,7 @@ prop_compose! {
     fn configs()(
         domain in "[A-Za-z0-9_-]{1,32}",
         runtime_dir in "(/[a-z é\"]{1,9}){0,3}",
+        group in "[a-z é\"]{0,9}",
         name in names(),
         transports in kinds(),
         deadline in 1..=3_600_000_000_000_u64,
@@ -452,6 +455,7 @@ prop_compose! {
         let mut config = Config::for_host("sherpa");
         config.domain = domain;
         config.runtime_dir = runtime_dir;
+        config.group = group;
         config.mts.name = name;
         config.mts.transports = transports;
         config.mts.deadline = Duration::from_nanos(deadline);
