@@ -87,6 +87,7 @@ fn show_prints_an_equivalent_configuration_file() {
     let expected = "\
 domain = \"lab\"                       # fipa.toml:1
 runtime_dir = \"\"                     # default
+group = \"\"                           # default
 
 [mts]
 name = \"sherpa\"                      # fipa.toml:3

@@ -229,9 +229,10 @@ impl DomainDir {
             let created = users.create_directory(&path);
             drop(created.map_err(|error| self.unusable(error))?);
             users.open_to_group(&path).map_err(io_error(&path))?;
+            self.check_owner(users)?;
         }
         self.create_memory_of_user();
-        self.check_owner(users)
+        Ok(())
     }
 
     /// Checks that only the users of the domain can enter a level.

@@ -326,6 +326,7 @@ static = { crex-mts = ["tcp://10.0.0.2:7788"] }
     let effective = load(file, &["mts.deadline=90s", "routes.'a b'=tcp"]).unwrap();
     let expected = r#"domain = "lab"                       # fipa.toml:2
 runtime_dir = ""                     # default
+group = ""                           # default
 
 [mts]
 name = "sherpa-mts"                  # default
