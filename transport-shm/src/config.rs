@@ -6,6 +6,13 @@ use std::time::Duration;
 use fipa_transport::Incarnation;
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
 
+/// Maximum of [`ShmConfig::max_letter`]: 2^40, or what 32-bit processes can address.
+const MAX_LETTER: usize = if usize::BITS < 64 {
+    usize::MAX
+} else {
+    1 << 40
+};
+
 /// Configuration of one endpoint.
 ///
 /// All processes of a domain use the same `root` and `prefix`; processes of different domains
@@ -105,7 +112,7 @@ impl ShmConfig {
             return Err(wrong("the incarnation of this process is not set".into()));
         }
         for (name, value, least, most) in [
-            ("max_letter", self.max_letter, 1, 1 << 40),
+            ("max_letter", self.max_letter, 1, MAX_LETTER),
             ("max_clients", self.max_clients, 1, 4096),
             ("max_peers", self.max_peers, 1, 4096),
             ("window", self.window, 2, 128),
@@ -217,6 +224,19 @@ pub enum ShmError {
         path: PathBuf,
         /// The problem, such as `has mode 0755`.
         problem: String,
+    },
+    /// Processes of another layout have the shared memory of the domain.
+    #[error(
+        "the {others} processes of the domain in {path} have its shared memory, and this process is {this}; run \
+         programs of one width, or remove the transport \"shm\": Unix sockets connect both"
+    )]
+    OtherLayout {
+        /// The directory of the domain.
+        path: PathBuf,
+        /// The others, such as `64-bit`.
+        others: &'static str,
+        /// This process, such as `32-bit`.
+        this: &'static str,
     },
     /// An iceoryx2 operation failed.
     #[error(

@@ -4,6 +4,9 @@
 //! name of one that the first process of the domain needs, and the domain would have no shared memory.
 //! The names are visible while the domain has processes, so the secret ends with the last of them.
 //!
+//! The last digit states the layout of the structures in shared memory, which processes of another layout
+//! must not read.
+//!
 //! The secret is the target of a symbolic link in the private directory of the domain, because a link
 //! is created together with its target: no process reads half a secret.
 
@@ -13,8 +16,27 @@ use std::path::{Path, PathBuf};
 /// Name of the link.
 const LINK: &str = "secret";
 
-/// Length of a secret in hexadecimal digits.
-pub(crate) const LEN: usize = 16;
+/// Number of random hexadecimal digits of a secret. One more states the layout.
+const RANDOM: usize = 16;
+
+/// The layout of this process: the bytes of a pointer, which iceoryx2 has in shared memory. One more for the other
+/// byte order.
+pub(crate) const LAYOUT: char = match (usize::BITS, cfg!(target_endian = "little")) {
+    (32, true) => '4',
+    (32, false) => '5',
+    (_, true) => '8',
+    (_, false) => '9',
+};
+
+/// Names the processes of a layout.
+pub(crate) fn layout_name(layout: char) -> &'static str {
+    match layout {
+        '4' => "32-bit",
+        '8' => "64-bit",
+        '5' | '9' => "big-endian",
+        _ => "other",
+    }
+}
 
 /// The secret of a domain.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -34,7 +56,17 @@ impl Secret {
     /// Draws a secret.
     pub(crate) fn draw() -> io::Result<Self> {
         let drawn = getrandom::u64().map_err(io::Error::other)?;
-        Ok(Self(format!("{drawn:0LEN$x}")))
+        Ok(Self(format!("{drawn:0RANDOM$x}{LAYOUT}")))
+    }
+
+    /// Whether the processes of the domain lay out shared memory as this one does.
+    pub(crate) fn has_this_layout(&self) -> bool {
+        self.layout() == LAYOUT
+    }
+
+    /// The layout of the processes of the domain.
+    pub(crate) fn layout(&self) -> char {
+        self.0.chars().last().unwrap_or_default()
     }
 
     /// Makes this the secret of a domain without one. The caller must hold the domain's lock.
@@ -56,7 +88,8 @@ impl Secret {
     }
 
     fn parse(text: &str) -> Option<Self> {
-        let is_secret = text.len() == LEN && text.bytes().all(|digit| digit.is_ascii_hexdigit());
+        let is_secret =
+            text.len() == RANDOM + 1 && text.bytes().all(|digit| digit.is_ascii_hexdigit());
         is_secret.then(|| Self(text.to_owned()))
     }
 }
@@ -89,14 +122,23 @@ mod tests {
     }
 
     #[test]
+    fn a_secret_states_the_layout_of_the_domain() {
+        assert!(Secret::draw().unwrap().has_this_layout());
+        let [narrow, wide] = [4, 8].map(|width| Secret(format!("0123456789abcdef{width}")));
+        assert_ne!(narrow.has_this_layout(), wide.has_this_layout());
+        assert_eq!(layout_name(narrow.layout()), "32-bit");
+        assert_eq!(layout_name(wide.layout()), "64-bit");
+    }
+
+    #[test]
     fn the_secret_is_read_from_the_name_of_a_file() {
-        let secret = Secret("0123456789abcdef".to_owned());
+        let secret = Secret("0123456789abcdef8".to_owned());
         for (name, found) in [
-            ("fipa_x_0123456789abcdef_17.page", Some(secret)),
-            ("fipa_x_0123456789abcdef", None),
-            ("fipa_x_0123456789abcde_17.page", None),
-            ("fipa_y_0123456789abcdef_17.page", None),
-            ("fipa_x0123456789abcdef_17.page", None),
+            ("fipa_x_0123456789abcdef8_17.page", Some(secret)),
+            ("fipa_x_0123456789abcdef8", None),
+            ("fipa_x_0123456789abcdef_17.page", None),
+            ("fipa_y_0123456789abcdef8_17.page", None),
+            ("fipa_x0123456789abcdef8_17.page", None),
         ] {
             assert_eq!(Secret::in_name("fipa_x", name), found, "{name}");
         }
@@ -107,9 +149,9 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         for target in [
             "",
-            "0123456789abcde",
+            "0123456789abcdef",
             "../../../../x/y",
-            "0123456789abcdef0",
+            "0123456789abcdef80",
         ] {
             remove(root.path());
             if std::os::unix::fs::symlink(target, path(root.path())).is_err() {

@@ -150,7 +150,11 @@ impl DomainFiles {
         })?;
         let failed = |e| file_error("cannot create", &secret::path(root), e);
         let secret = match secret_of(config)? {
-            Some(secret) => secret,
+            Some(secret) if secret.has_this_layout() => secret,
+            Some(other) => {
+                Self::end_other_layout(config, other, &lock)?;
+                Secret::draw().map_err(failed)?
+            }
             None => Secret::draw().map_err(failed)?,
         };
         if Secret::read(root).map_err(failed)?.is_none() {
@@ -159,6 +163,32 @@ impl DomainFiles {
         let domain = Self::new(config, Some(secret))?;
         make_private(domain.paths.directory())?;
         Ok((domain, lock))
+    }
+
+    /// Removes the files of a domain with this secret, whose processes have another layout than this one.
+    ///
+    /// # Errors
+    /// If one of them runs.
+    fn end_other_layout(
+        config: &ShmConfig,
+        secret: Secret,
+        lock: &OwnedFd,
+    ) -> Result<(), ShmError> {
+        let others = secret::layout_name(secret.layout());
+        let domain = Self::new(config, Some(secret))?;
+        if domain
+            .all()?
+            .into_iter()
+            .any(|one| domain.paths.is_alive(one))
+        {
+            return Err(ShmError::OtherLayout {
+                path: config.root.clone(),
+                others,
+                this: secret::layout_name(secret::LAYOUT),
+            });
+        }
+        domain.remove_all(lock);
+        Ok(())
     }
 
     /// Keeps other processes from starting and cleaning up until the result is dropped. The lock is
@@ -327,6 +357,13 @@ impl DomainFiles {
         cleaned.alive = alive.len();
         if self.is_current(&lock) {
             cleaned.removed = gone.len();
+        }
+        if self.secret.as_ref().is_some_and(|it| !it.has_this_layout()) {
+            // The files of iceoryx2 cannot be read here.
+            if cleaned.alive == 0 {
+                self.remove_all(&lock);
+            }
+            return Ok(cleaned);
         }
         let nodes = self.nodes()?;
         let is_dead = |node: &NodeState<Svc>| matches!(node, NodeState::Dead(_));
@@ -560,6 +597,38 @@ pub(crate) fn file_error(
 mod tests {
     use super::*;
     use crate::presence::Presence;
+
+    #[test]
+    fn a_domain_of_processes_of_another_layout_is_refused_until_they_have_ended() {
+        let directory = tempfile::tempdir().unwrap();
+        let root = directory.path().join("shm");
+        let prefix = format!("fipatest-layout-{}", std::process::id());
+        let own = Incarnation::from_u64(7);
+        let config = ShmConfig::new(&root, prefix, own);
+        let (started, lock) = DomainFiles::enter(&config).unwrap();
+        let digits = started.secret.clone().unwrap();
+        let (random, _) = digits.as_str().split_at(digits.as_str().len() - 1);
+        let other = ['4', '8'].into_iter().find(|it| *it != secret::LAYOUT);
+        let name = format!("x_{random}{}_", other.unwrap());
+        let secret = Secret::in_name("x", &name).unwrap();
+        secret.store(&root).unwrap();
+        drop(lock);
+        let others = DomainFiles::of(&config).unwrap();
+        let presence = Presence::create(others.paths().clone(), own).unwrap();
+        let refused = DomainFiles::enter(&config).unwrap_err();
+        assert!(matches!(refused, ShmError::OtherLayout { .. }), "{refused}");
+        assert_eq!(others.clean(false).unwrap().alive, 1);
+        assert!(others.paths().is_alive(own));
+
+        drop(presence);
+        let left = others.paths().status_page(own);
+        std::fs::write(&left, "").unwrap();
+        let (started, lock) = DomainFiles::enter(&config).unwrap();
+        assert!(started.secret.as_ref().unwrap().has_this_layout());
+        assert!(!left.exists());
+        drop(lock);
+        started.clean(true).unwrap();
+    }
 
     /// A process that ends cleans up last of all, and a tool may have read the directory before.
     #[test]
