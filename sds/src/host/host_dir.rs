@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{DirectoryError, DomainUsers, log_limit};
 use parking_lot::{Mutex, MutexGuard};
-use rustix::fs::{AtFlags, FileType, FlockOperation, Mode, OFlags, Timespec, Timestamps};
+use rustix::fs::{AtFlags, FileType, FlockOperation, Mode, OFlags, Stat, Timespec, Timestamps};
 use rustix::io::Errno;
 
 use super::file::MAX_SIZE;
@@ -215,7 +215,7 @@ impl HostDir {
 
     /// Whether other processes can still find the directory and the files of this process.
     pub(super) fn is_there(&self) -> Result<bool, HostError> {
-        let examined = |found: Result<rustix::fs::Stat, Errno>| match found {
+        let examined = |found: Result<Stat, Errno>| match found {
             Ok(stat) => Ok(Some((stat.st_dev, stat.st_ino))),
             Err(Errno::NOENT | Errno::NOTDIR) => Ok(None),
             Err(error) => Err(HostError::Io {
@@ -407,7 +407,7 @@ impl HostDir {
     /// Time of the last creation, removal or replacement of a file.
     pub(super) fn changed(&self) -> Result<(i64, u64), HostError> {
         match rustix::fs::fstat(&self.dir) {
-            Ok(stat) => Ok((stat.st_mtime, stat.st_mtime_nsec)),
+            Ok(stat) => Ok(modified(&stat)),
             Err(error) => Err(HostError::Io {
                 what: "examine",
                 path: self.path.clone(),
@@ -452,7 +452,7 @@ impl HostDir {
     pub(super) fn version(&self, name: Name) -> Result<Option<Version>, HostError> {
         match rustix::fs::statat(&self.dir, name.to_string(), AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) => Ok(Some(Version {
-                modified: (stat.st_mtime, stat.st_mtime_nsec),
+                modified: modified(&stat),
                 inode: stat.st_ino,
                 len: stat.st_size,
             })),
@@ -564,6 +564,14 @@ pub(super) struct Version {
     modified: (i64, u64),
     inode: u64,
     len: i64,
+}
+
+#[allow(
+    clippy::useless_conversion,
+    reason = "the nanoseconds of 32-bit systems are a u32"
+)]
+fn modified(stat: &Stat) -> (i64, u64) {
+    (stat.st_mtime, stat.st_mtime_nsec.into())
 }
 
 /// Maximum number of files in a directory: five per process, for more processes than a host runs.
