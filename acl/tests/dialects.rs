@@ -222,7 +222,7 @@ fn refused_for_a_reason(error: &EncodeError) -> bool {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(192))]
+    #![proptest_config(ProptestConfig::with_cases(ProptestConfig::default().cases.min(192)))]
 
     #[test]
     fn a_message_is_the_same_after_a_round_trip_or_is_refused(message in message().boxed()) {

@@ -131,7 +131,7 @@ fn never_panics(bytes: &[u8]) {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(192))]
+    #![proptest_config(ProptestConfig::with_cases(ProptestConfig::default().cases.min(192)))]
 
     #[test]
     fn encoded_len_is_the_length_of_the_encoded_message(message in message().boxed()) {

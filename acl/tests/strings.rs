@@ -360,7 +360,7 @@ fn survives(message: &Message, bytes: &Bytes, dialect: Dialect) {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(192))]
+    #![proptest_config(ProptestConfig::with_cases(ProptestConfig::default().cases.min(192)))]
 
     #[test]
     fn a_message_is_the_same_after_a_round_trip_or_is_refused(message in message().boxed()) {

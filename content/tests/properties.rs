@@ -81,7 +81,7 @@ fn damaged() -> impl Strategy<Value = Vec<u8>> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(192))]
+    #![proptest_config(ProptestConfig::with_cases(ProptestConfig::default().cases.min(192)))]
 
     #[test]
     fn what_was_printed_reads_the_same(content in content()) {
