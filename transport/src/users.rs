@@ -111,7 +111,13 @@ impl DomainUsers {
         let directory = match open(path) {
             Ok(directory) => directory,
             Err(Errno::LOOP | Errno::NOTDIR) => return Err(not_private(Intrusion::NoDirectory)),
-            Err(error) => return Err(io_error("open", path)(error.into())),
+            Err(error) => {
+                // That the directory belongs to another user says more than that this user may not open it.
+                if let (Errno::ACCESS, Ok(found)) = (error, rustix::fs::lstat(path)) {
+                    self.check(&found).map_err(not_private)?;
+                }
+                return Err(io_error("open", path)(error.into()));
+            }
         };
         let found = rustix::fs::fstat(&directory);
         let found = found.map_err(|error| io_error("examine", path)(error.into()))?;
