@@ -132,7 +132,9 @@ fn the_users_of_a_group_exchange_letters_inside() {
 
     let outsider = robot.run(PLANNER, PLANNER, &["agents"]).failed(1);
     assert!(outsider.contains("add the user to the group"), "{outsider}");
-    let other = robot.run(PLANNER, CREW, &["agents", "--set", "group="]).failed(1);
+    let other = robot
+        .run(PLANNER, CREW, &["agents", "--set", "group="])
+        .failed(1);
     assert!(other.contains("it belongs to user root (0)"), "{other}");
     let doctor = robot.run(PLANNER, CREW, &["doctor"]);
     let report = String::from_utf8(doctor.stdout).unwrap();
