@@ -14,7 +14,6 @@ use fipa_transport::{DomainUsers, log_limit};
 use parking_lot::Mutex;
 
 use crate::access::rules::{Access, LetterFacts, Refusal};
-use crate::domain::accounts::user_name;
 
 /// Log target of the lines about refused letters.
 const AUDIT: &str = "fipa::audit";
@@ -35,9 +34,8 @@ pub(crate) enum Of {
     /// The gateway with this name. Every sender may send letters to the gateway itself, because
     /// gateways and their agents communicate this way.
     Gateway(Arc<str>),
-    /// Another process. The gateway of the host is identified by its
-    /// link. It may send its own letters to every agent, because they are answers only. The letters
-    /// that it forwards are not counted again, because it has counted them.
+    /// Another process. The gateway of the host is identified by its link. It may send its own letters to every agent,
+    /// because they are answers only. The letters that it forwards are not counted again, because it has counted them.
     Process,
 }
 
@@ -101,11 +99,9 @@ impl RulesGate {
             return Err(Refused::Other(fault.clone()));
         }
         let sender = &*letter.sender;
-        let gateway = self.gateway_on(link);
         let facts = LetterFacts {
             sender,
-            // The user of the gateway has only passed on a letter of another host.
-            user: user_at(link).filter(|_| gateway.is_none()),
+            user: user_at(link),
             receiver,
             performative: &letter.performative,
             protocol: letter.protocol.as_deref(),
@@ -123,6 +119,7 @@ impl RulesGate {
                     .and_then(|()| access.count(link.source, sender, now))
             }
         };
+        let gateway = self.gateway_on(link);
         let is_known = gateway.is_some();
         judge(gateway).or_else(|refusal| {
             // The gateway may have registered a moment ago. The directory is refreshed only for
@@ -170,13 +167,14 @@ impl RulesGate {
         (is_gateway && is_proved).then_some(entry)
     }
 
-    /// Checks that a process of this host sends no letter in the name of an agent of another user.
+    /// Checks that a process of this host sends no letter in the name of an agent of another user. A gateway is no
+    /// exception: any process of the domain can register as one, and it passes on letters of other hosts only.
     fn check_user(&self, sender: &str, link: Link) -> Result<(), Refused> {
         let Some(user) = user_at(link).filter(|_| is_shared(&self.host)) else {
             return Ok(());
         };
         let other = || self.host.user_of(sender).filter(|owner| *owner != user);
-        if other().is_none() || self.gateway_on(link).is_some() {
+        if other().is_none() {
             return Ok(());
         }
         // The agent may have moved to a process of this user a moment ago.
@@ -184,9 +182,7 @@ impl RulesGate {
         match other() {
             None => Ok(()),
             Some(owner) => Err(Refused::Other(format!(
-                "{sender} is an agent of {}, but a process of {} has sent the letter",
-                user_name(owner),
-                user_name(user)
+                "{sender} is an agent of user {owner}, but a process of user {user} has sent the letter"
             ))),
         }
     }
@@ -476,7 +472,7 @@ mod tests {
         );
         sent("rover", by_user(None, Kind::Unix)).unwrap();
         sent("crex", by_user(Some(another), Kind::Unix)).unwrap();
-        // The gateway of this user passes letters on, and another user cannot claim to be that gateway.
+        // Another user cannot claim to be the gateway of this user.
         register(&other, &gate);
         let gateway = gateway_by(Kind::Unix);
         assert!(gate.gateway_on(gateway).is_some());
@@ -485,5 +481,6 @@ mod tests {
             ..gateway
         };
         assert!(gate.gateway_on(claimed).is_none());
+        sent("rover", claimed).unwrap_err();
     }
 }

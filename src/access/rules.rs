@@ -29,7 +29,7 @@ const MAX_SENDERS: usize = 8192;
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LetterFacts<'a> {
     pub(crate) sender: &'a str,
-    /// The user of the process on this host that sent it, as the kernel names it; `None` if that is not known.
+    /// The user of the process on this host that handed it over, as the kernel names it; `None` if that is not known.
     pub(crate) user: Option<u32>,
     pub(crate) receiver: &'a str,
     pub(crate) performative: &'a str,
