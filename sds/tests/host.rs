@@ -19,7 +19,7 @@ use fipa_sds::{
     RegisterError, Role, Source,
 };
 use fipa_testbed::{ChildGuard, until_some_async};
-use fipa_transport::{DomainUsers, Incarnation};
+use fipa_transport::{DirectoryError, DomainUsers, Incarnation};
 
 fn config(dir: &Path) -> HostConfig {
     HostConfig {
@@ -491,14 +491,16 @@ async fn concurrent_joins_and_leaves_leave_no_files() {
 #[tokio::test]
 async fn a_directory_that_is_not_private_is_refused() {
     let refused = |dir: &Path| match HostDirectory::open(config(dir)) {
-        Err(HostError::NotPrivate { why, .. }) => why,
+        Err(HostError::Directory(DirectoryError::NotPrivate { intrusion, .. })) => {
+            intrusion.to_string()
+        }
         other => panic!("{other:?}"),
     };
     let parent = tempfile::tempdir().unwrap();
     let real = parent.path().join("real");
     std::fs::create_dir(&real).unwrap();
     std::fs::set_permissions(&real, PermissionsExt::from_mode(0o750)).unwrap();
-    assert!(refused(&real).contains("0750"));
+    assert!(refused(&real).contains("750"));
     std::fs::set_permissions(&real, PermissionsExt::from_mode(0o700)).unwrap();
     drop(open(&real));
 
@@ -670,7 +672,7 @@ async fn processes_connect_to_the_sockets_they_find() {
     use rustix::net::{RecvFlags, SendFlags, SocketFlags, accept_with, recv, send};
     let (_parent, dir) = fresh_dir();
     // Longer than the path of a socket may be.
-    let dir = dir.join("x".repeat(120));
+    let dir = dir.with_file_name("x".repeat(120));
     let (one, mut other) = (open(&dir), Process::start(&dir));
     let mut sockets = one.sockets();
     assert_eq!(*sockets.borrow_and_update(), []);
