@@ -117,7 +117,7 @@ fn the_users_of_a_group_exchange_letters_inside() {
 
     for path in files(Path::new(RUN)) {
         let found = fs::symlink_metadata(&path).unwrap();
-        // What a gateway keeps for its successor is its own.
+        // The state that a gateway keeps for its successor belongs to its user.
         if path.file_name().is_some_and(|name| name == "gateway.state") {
             assert_eq!(found.mode() & 0o777, 0o600);
             continue;

@@ -23,6 +23,8 @@ pub(crate) struct RulesGate {
     access: Mutex<Access>,
     of: Of,
     host: Arc<HostDirectory>,
+    /// The user of this process.
+    this_user: u32,
     is_active: AtomicBool,
     /// Whether a rule names an action, so that contents are read.
     #[cfg(feature = "actions")]
@@ -47,6 +49,7 @@ impl RulesGate {
             is_active: AtomicBool::new(is_shared(&host)),
             of,
             host,
+            this_user: rustix::process::geteuid().as_raw(),
             #[cfg(feature = "actions")]
             names_actions: AtomicBool::new(false),
         }
@@ -101,7 +104,7 @@ impl RulesGate {
         let sender = &*letter.sender;
         let facts = LetterFacts {
             sender,
-            user: user_at(link),
+            user: self.user_at(link),
             receiver,
             performative: &letter.performative,
             protocol: letter.protocol.as_deref(),
@@ -163,14 +166,21 @@ impl RulesGate {
         let entry = self.host.known_incarnation(link.service)?;
         let is_gateway = entry.role == EntryRole::Gateway;
         // The service at the other end of a link only claims its incarnation, also to other users.
-        let is_proved = !is_shared(&self.host) || self.host.user_of(&entry.name) == user_at(link);
+        let is_proved =
+            !is_shared(&self.host) || self.host.user_of(&entry.name) == self.user_at(link);
         (is_gateway && is_proved).then_some(entry)
+    }
+
+    /// Returns the user of the process at the other end of a link within this host.
+    fn user_at(&self, link: Link) -> Option<u32> {
+        let is_process = matches!(link.source, LetterSource::Process(_));
+        (link.via.is_host_local() && is_process).then(|| link.user.unwrap_or(self.this_user))
     }
 
     /// Checks that a process of this host sends no letter in the name of an agent of another user. A gateway is no
     /// exception: any process of the domain can register as one, and it passes on letters of other hosts only.
     fn check_user(&self, sender: &str, link: Link) -> Result<(), Refused> {
-        let Some(user) = user_at(link).filter(|_| is_shared(&self.host)) else {
+        let Some(user) = self.user_at(link).filter(|_| is_shared(&self.host)) else {
             return Ok(());
         };
         let other = || self.host.user_of(sender).filter(|owner| *owner != user);
@@ -199,13 +209,6 @@ impl RulesGate {
 /// Whether the domain has several users.
 fn is_shared(host: &HostDirectory) -> bool {
     host.users() != DomainUsers::This
-}
-
-/// Returns the user of the process at the other end of a link within this host.
-fn user_at(link: Link) -> Option<u32> {
-    let this = || rustix::process::geteuid().as_raw();
-    let is_process = matches!(link.source, LetterSource::Process(_));
-    (link.via.is_host_local() && is_process).then(|| link.user.unwrap_or_else(this))
 }
 
 /// The reason why a letter is refused.

@@ -242,7 +242,7 @@ impl DomainDir {
     }
 
     /// Checks that the upper level belongs to a member of the group, or to root. Otherwise its owner could open it to
-    /// other users: files in a directory with the set-group-ID bit have its group, whoever creates them.
+    /// other users: in a directory with the set-group-ID bit, a stranger creates directories of its group, too.
     fn check_owner(&self, users: DomainUsers) -> Result<(), DomainDirError> {
         let DomainUsers::Group(group) = users else {
             return Ok(());

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, Intrusion};
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
 
 /// Maximum of [`ShmConfig::max_letter`]: 2^40, or what 32-bit processes can address.
@@ -19,8 +19,8 @@ const MAX_LETTER: usize = if usize::BITS < 64 {
 /// differ in both.
 #[derive(Debug, Clone)]
 pub struct ShmConfig {
-    /// Private directory of the domain. Created with mode 0700 if it is missing; must belong to
-    /// this user and be closed to other users.
+    /// Private directory of the domain. Created with mode 0700 if it is missing, in a directory that exists; must
+    /// belong to this user and be closed to other users.
     pub root: PathBuf,
     /// Prefix of the names of all shared memory files of this domain: 1 to
     /// [`ShmConfig::MAX_PREFIX`] ASCII letters, digits, `-` and `_`. Random digits follow it, which
@@ -216,14 +216,14 @@ pub enum ShmError {
     },
     /// The directory of the domain is not private.
     #[error(
-        "the directory {path} {problem}; it must be a directory of this user with mode 0700, because \
+        "the directory {path} cannot be used: {intrusion}; it must be a directory of this user with mode 0700, because \
          any user with write access to it can read every letter"
     )]
     NotPrivate {
         /// The directory.
         path: PathBuf,
-        /// The problem, such as `has mode 0755`.
-        problem: String,
+        /// The reason, such as `its mode is 755`.
+        intrusion: Intrusion,
     },
     /// Processes of another layout have the shared memory of the domain.
     #[error(

@@ -54,9 +54,6 @@ const BACKLOG: u32 = 128;
 /// Pause after a connection could not be accepted, for example because there are too many open files.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Maximum length of a certificate, in bytes: that of [`Certificate::from_der`].
-const MAX_CERTIFICATE: usize = 64 * 1024;
-
 /// The result of a pairing.
 #[derive(Debug)]
 #[non_exhaustive]
@@ -326,7 +323,7 @@ async fn certificate_of_peer(
     write(stream, &confirmed.tagged(Kind::Certificate, der)).await?;
 
     let len = u32::from_be_bytes(read(stream).await?) as usize;
-    if len > MAX_CERTIFICATE {
+    if len > Certificate::MAX_LEN {
         return Err(PairingError::TooLong(len));
     }
     let mut message = vec![0; len + TAG];

@@ -30,9 +30,6 @@ const KEPT: &AsciiSet = &NON_ALPHANUMERIC
     .remove(b'_')
     .remove(b'~');
 
-/// Maximum length of a certificate, in bytes.
-const MAX_LEN: usize = 64 * 1024;
-
 /// Maximum length of a name, in bytes.
 const MAX_NAME: usize = 1024;
 
@@ -104,7 +101,7 @@ pub struct Certified {
 #[non_exhaustive]
 pub enum CertificateError {
     /// The certificate is longer than 64 KiB.
-    #[error("the certificate has {0} bytes; at most {MAX_LEN} are allowed")]
+    #[error("the certificate has {0} bytes; at most {max} are allowed", max = Certificate::MAX_LEN)]
     TooLong(usize),
     /// The bytes are not an X.509 certificate.
     #[error("not an X.509 certificate: {}", escape(.0))]
@@ -142,12 +139,15 @@ pub enum CertificateError {
 }
 
 impl Certificate {
+    /// Maximum length of a certificate, in bytes.
+    pub const MAX_LEN: usize = 64 * 1024;
+
     /// Parses a certificate in DER form.
     ///
     /// # Errors
     /// When the bytes are not a certificate, or the certificate names no service.
     pub fn from_der(der: Vec<u8>) -> Result<Self, CertificateError> {
-        if der.len() > MAX_LEN {
+        if der.len() > Certificate::MAX_LEN {
             return Err(CertificateError::TooLong(der.len()));
         }
         let malformed = |error: &dyn fmt::Display| CertificateError::Malformed(error.to_string());
@@ -221,7 +221,7 @@ pub(super) fn left_until(last: i64, now: SystemTime) -> Duration {
 /// Returns the last second at which a certificate in DER form is valid. `None` if it cannot be parsed.
 #[cfg(feature = "http")]
 pub(super) fn last_second(der: &[u8]) -> Option<i64> {
-    if der.len() > MAX_LEN {
+    if der.len() > Certificate::MAX_LEN {
         return None;
     }
     let (_, read) = X509Certificate::from_der(der).ok()?;

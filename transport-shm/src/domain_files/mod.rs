@@ -7,12 +7,11 @@
 
 use std::fs::DirEntry;
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use fipa_transport::Incarnation;
+use fipa_transport::{DirectoryError, DomainUsers, Incarnation};
 use iceoryx2::node::{Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
 use parking_lot::Mutex;
@@ -176,11 +175,7 @@ impl DomainFiles {
     ) -> Result<(), ShmError> {
         let others = secret::layout_name(secret.layout());
         let domain = Self::new(config, Some(secret))?;
-        if domain
-            .all()?
-            .into_iter()
-            .any(|one| domain.paths.is_alive(one))
-        {
+        if domain.has_living()? {
             return Err(ShmError::OtherLayout {
                 path: config.root.clone(),
                 others,
@@ -326,6 +321,12 @@ impl DomainFiles {
     /// as true, and `clean` reports it.
     pub(crate) fn has_dead(&self) -> bool {
         !self.count().is_ok_and(|(_, dead)| dead == 0)
+    }
+
+    /// Whether a process of the domain runs.
+    fn has_living(&self) -> Result<bool, ShmError> {
+        let mut all = self.all()?.into_iter();
+        Ok(all.any(|one| self.paths.is_alive(one)))
     }
 
     fn all(&self) -> Result<Vec<Incarnation>, ShmError> {
@@ -527,11 +528,7 @@ fn secret_of(config: &ShmConfig) -> Result<Option<Secret>, ShmError> {
             continue;
         }
         let domain = DomainFiles::new(config, Some(secret.clone()))?;
-        if domain
-            .all()?
-            .into_iter()
-            .any(|one| domain.paths.is_alive(one))
-        {
+        if domain.has_living()? {
             return Ok(Some(secret));
         }
         examined.push(secret);
@@ -557,28 +554,15 @@ fn lock_root(
 }
 
 fn make_private(directory: &Path) -> Result<(), ShmError> {
-    let mut builder = std::fs::DirBuilder::new();
-    builder
-        .recursive(true)
-        .mode(0o700)
-        .create(directory)
-        .map_err(|e| file_error("cannot create the directory", directory, e))?;
-    let metadata = std::fs::symlink_metadata(directory)
-        .map_err(|e| file_error("cannot examine the directory", directory, e))?;
-    let me = rustix::process::geteuid().as_raw();
-    let problem = if !metadata.is_dir() {
-        "is not a directory".to_owned()
-    } else if metadata.uid() != me {
-        format!("belongs to user {}, and this is user {me}", metadata.uid())
-    } else if metadata.mode() & 0o077 != 0 {
-        format!("has mode {:04o}", metadata.mode() & 0o7777)
-    } else {
-        return Ok(());
-    };
-    Err(ShmError::NotPrivate {
-        path: directory.to_owned(),
-        problem,
-    })
+    let failed = |source| file_error("cannot create or open the directory", directory, source);
+    match DomainUsers::This.create_directory(directory) {
+        Ok(_) => Ok(()),
+        Err(DirectoryError::NotPrivate { path, intrusion }) => {
+            Err(ShmError::NotPrivate { path, intrusion })
+        }
+        Err(DirectoryError::Io { source, .. }) => Err(failed(source)),
+        Err(other) => Err(failed(std::io::Error::other(other))),
+    }
 }
 
 pub(crate) fn file_error(
