@@ -138,7 +138,7 @@ fn keys(config: &Config, found: &mut Vec<Finding>) {
     if dir.is_empty() || dir.starts_with('~') {
         return;
     }
-    if let Err(error) = Keys::at(dir).credentials_of(&config.mts.name) {
+    if let Err(error) = Keys::at(dir).examined_credentials_of(&config.mts.name) {
         let help = match &error {
             KeysError::Missing(_) => {
                 "make keys (`fipa keys init`), or name the directory that has them"

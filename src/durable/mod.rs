@@ -6,6 +6,9 @@
 //! read.
 //!
 //! This assumes that a rename is atomic, as on the journaling and copy-on-write file systems of Linux.
+//!
+//! What root creates in a directory of another user gets the owner and the group of that directory: the user of a
+//! service can read what an operator writes with `sudo`.
 
 #[cfg(test)]
 pub(crate) mod cuts;
@@ -13,11 +16,13 @@ pub(crate) mod cuts;
 use std::ffi::OsString;
 use std::fs::{self, DirBuilder, File};
 use std::io::{self, Write as _};
-use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
+use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, fchown};
 use std::path::{Path, PathBuf};
 
 #[cfg(test)]
 use cuts::{Step, record};
+use rustix::fs::{Mode, OFlags, RenameFlags, mkdirat, openat, renameat_with};
+use rustix::process::geteuid;
 
 /// Replaces a file, or creates it.
 #[cfg(feature = "protocols")]
@@ -65,7 +70,7 @@ pub(crate) fn create_directories(path: &Path, mode: u32) -> io::Result<()> {
     if let Some(parent) = parent(path) {
         create_directories(parent, mode)?;
     }
-    match DirBuilder::new().mode(mode).create(path) {
+    match create_directory(path, mode) {
         Ok(()) => {}
         // Another process was faster.
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists && path.is_dir() => {}
@@ -76,21 +81,99 @@ pub(crate) fn create_directories(path: &Path, mode: u32) -> io::Result<()> {
     sync_parent(path)
 }
 
+/// Opens an empty file that processes lock, and creates it unless it exists. It is not synced.
+#[cfg(feature = "protocols")]
+pub(crate) fn lock_file(path: &Path) -> io::Result<File> {
+    loop {
+        match create_new(path, 0o666) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+            created => return created,
+        }
+        match File::options().write(true).open(path) {
+            // Another process has removed it.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            opened => return opened,
+        }
+    }
+}
+
+fn create_directory(path: &Path, mode: u32) -> io::Result<()> {
+    let parent = File::open(parent(path).unwrap_or(Path::new("/")))?;
+    let (Some(owner), Some(name)) = (Owner::of_new_in(&parent)?, path.file_name()) else {
+        return DirBuilder::new().mode(mode).create(path);
+    };
+    // A cut leaves no directory of root, which a repetition of the call would use.
+    let new = unique(Path::new(name))?;
+    mkdirat(&parent, &new, Mode::from_raw_mode(mode))?;
+    let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+    let directory = File::from(openat(&parent, &new, flags, Mode::empty())?);
+    owner.give(&directory)?;
+    directory.sync_all()?;
+    let renamed = renameat_with(&parent, &new, &parent, name, RenameFlags::NOREPLACE);
+    renamed.map_err(|error| {
+        // The error is that of the rename.
+        let _ = rustix::fs::unlinkat(&parent, &new, rustix::fs::AtFlags::REMOVEDIR);
+        error.into()
+    })
+}
+
 /// Writes and syncs a file beside this one, and returns its path.
 fn write_beside(path: &Path, bytes: &[u8], mode: u32) -> io::Result<PathBuf> {
-    // A name of its own, because another process may write the same file.
-    let number = getrandom::u64().map_err(io::Error::other)?;
-    let mut new = OsString::from(path);
-    new.push(format!(".{number:016x}.new"));
-    let new = PathBuf::from(new);
-    let mut options = File::options();
-    let mut file = options.write(true).create_new(true).mode(mode).open(&new)?;
+    let new = unique(path)?;
+    let mut file = create_new(&new, mode)?;
     #[cfg(test)]
     record(Step::Write(new.clone(), bytes.to_owned()));
     or_remove(&new, file.write_all(bytes).and_then(|()| file.sync_all()))?;
     #[cfg(test)]
     record(Step::Sync(new.clone()));
     Ok(new)
+}
+
+/// A name that no other process uses, because another process may write the same file.
+fn unique(path: &Path) -> io::Result<PathBuf> {
+    let number = getrandom::u64().map_err(io::Error::other)?;
+    let mut new = OsString::from(path);
+    new.push(format!(".{number:016x}.new"));
+    Ok(new.into())
+}
+
+/// Creates an empty file.
+///
+/// # Errors
+/// [`io::ErrorKind::AlreadyExists`] if there is a file or a link of this name.
+fn create_new(path: &Path, mode: u32) -> io::Result<File> {
+    let name = path.file_name().ok_or(io::ErrorKind::InvalidInput)?;
+    // The owner of the directory can replace it meanwhile: the file is created in the one that was examined.
+    let directory = File::open(parent(path).unwrap_or(Path::new("/")))?;
+    let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::CLOEXEC;
+    let file = File::from(openat(&directory, name, flags, Mode::from_raw_mode(mode))?);
+    if let Some(owner) = Owner::of_new_in(&directory)? {
+        or_remove(path, owner.give(&file))?;
+    }
+    Ok(file)
+}
+
+/// A user other than root, and a group.
+struct Owner {
+    user: u32,
+    group: u32,
+}
+
+impl Owner {
+    /// Returns the owner of new files in this directory, unless the kernel sets it: if this process is root, the
+    /// owner of the directory.
+    fn of_new_in(directory: &File) -> io::Result<Option<Self>> {
+        if !geteuid().is_root() {
+            return Ok(None);
+        }
+        let meta = directory.metadata()?;
+        let (user, group) = (meta.uid(), meta.gid());
+        Ok((user != 0).then_some(Self { user, group }))
+    }
+
+    fn give(&self, file: &File) -> io::Result<()> {
+        fchown(file, Some(self.user), Some(self.group))
+    }
 }
 
 /// Removes an unfinished file after an error.

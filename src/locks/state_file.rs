@@ -93,7 +93,7 @@ impl StateFile {
         };
         let parent = path.parent().unwrap_or(&directory);
         durable::create_directories(parent, 0o700).map_err(failed)?;
-        let lock = File::create(with_suffix(&path, ".lock")).map_err(failed)?;
+        let lock = durable::lock_file(&with_suffix(&path, ".lock")).map_err(failed)?;
         let started = Instant::now();
         while let Err(error) = lock.try_lock() {
             match error {

@@ -45,7 +45,7 @@ fn keys(now: SystemTime, config: &Config, checks: &mut Vec<Check>) {
     use crate::admin::keys::{Certificate, Holding, Keys, KeysError, Whose};
 
     let keys = Keys::at(&config.security.keys);
-    let credentials = match keys.credentials_of(&config.mts.name) {
+    let credentials = match keys.examined_credentials_of(&config.mts.name) {
         Ok(credentials) => credentials,
         Err(error) => {
             let advice = match error {

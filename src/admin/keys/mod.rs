@@ -9,7 +9,7 @@
 //! | `revoked/<fingerprint>.pem` | a certificate that must never be trusted again |
 //!
 //! All are PEM (RFC 7468). Only their owner and root may write to the directories and to the
-//! certificates of peers. A running gateway applies changes within seconds, without a restart. If the power fails while
+//! certificates of peers. What root creates in a directory of another user belongs to that user. A running gateway applies changes within seconds, without a restart. If the power fails while
 //! the next key replaces the own one, `next.pem` counts as the own certificate until the switch is repeated.
 //!
 //! Not in this module: the use of keys on connections (`fipa_transport_net::secure`).
@@ -31,6 +31,7 @@ pub use fipa_transport_net::secure::{
 };
 use fipa_transport_net::secure::{Credentials, alternative_names};
 use rcgen::{CertificateParams, DnType, KeyPair, PublicKeyData as _, SanType};
+use rustix::process::geteuid;
 use rustls_pki_types::pem::PemObject as _;
 use rustls_pki_types::{CertificateDer, PrivateKeyDer};
 
@@ -477,7 +478,19 @@ impl Keys {
     /// If there are no keys, if they belong to another service, or if a file cannot be read or has
     /// unsafe permissions.
     pub fn credentials_of(&self, mts: &str) -> Result<Credentials, KeysError> {
-        let credentials = self.credentials()?;
+        self.named_credentials(mts, geteuid().as_raw())
+    }
+
+    /// Reads the credentials as a gateway of the [user](Self::user) of the keys does.
+    ///
+    /// # Errors
+    /// As for [`credentials_of`](Self::credentials_of).
+    pub(crate) fn examined_credentials_of(&self, mts: &str) -> Result<Credentials, KeysError> {
+        self.named_credentials(mts, self.user())
+    }
+
+    fn named_credentials(&self, mts: &str, user: u32) -> Result<Credentials, KeysError> {
+        let credentials = self.credentials(user)?;
         let certified = credentials.own.certified().mts();
         if certified != mts {
             return Err(KeysError::Name {
@@ -489,13 +502,21 @@ impl Keys {
         Ok(credentials)
     }
 
-    /// Reads the credentials without checking the name of the service.
+    /// The user whose gateway uses the keys: this one or, for root, the owner of the directory, whose keys root manages.
+    fn user(&self) -> u32 {
+        let this = geteuid();
+        match fs::metadata(&self.dir) {
+            Ok(meta) if this.is_root() => meta.uid(),
+            _ => this.as_raw(),
+        }
+    }
+
+    /// Reads the credentials of this user without checking the name of the service.
     ///
     /// # Errors
     /// If there are no keys, or if a file cannot be read or has unsafe permissions.
-    fn credentials(&self) -> Result<Credentials, KeysError> {
+    fn credentials(&self, user: u32) -> Result<Credentials, KeysError> {
         let own = self.own()?;
-        let user = rustix::process::geteuid().as_raw();
         let file = self.own_key();
         let meta = fs::metadata(&file).map_err(|source| io_error(&file, source))?;
         if meta.mode() & 0o077 != 0 || meta.uid() != user {
@@ -507,7 +528,7 @@ impl Keys {
             let Ok(meta) = fs::metadata(&dir) else {
                 continue;
             };
-            if can_be_written_by_others(&meta) {
+            if can_be_written_by_others(&meta, user) {
                 return Err(KeysError::Writable(dir));
             }
         }
@@ -551,6 +572,8 @@ impl Keys {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Default::default(),
             Err(error) => return (Vec::new(), vec![io_error(&dir, error)]),
         };
+        // A gateway refuses the directory of another user. So it gets no certificate of that user.
+        let user = self.user();
         let (mut all, mut unread) = (Vec::new(), Vec::new());
         for (number, entry) in listed.take(MAX_PEERS + 1).enumerate() {
             if number == MAX_PEERS {
@@ -560,7 +583,7 @@ impl Keys {
             }
             match entry.map(|entry| entry.path()) {
                 Ok(path) if path.extension().is_some_and(|it| it == "pem") => {
-                    let read = owned(&path).and_then(|()| read(&path));
+                    let read = owned(&path, user).and_then(|()| read(&path));
                     match read.and_then(|pem| only(&path, &pem)) {
                         Ok(certificate) => all.push(certificate),
                         Err(error) => unread.push(error),
@@ -581,15 +604,14 @@ impl Keys {
 }
 
 /// Whether users other than this one and root can change the file or directory.
-fn can_be_written_by_others(meta: &Metadata) -> bool {
-    let user = rustix::process::geteuid().as_raw();
+fn can_be_written_by_others(meta: &Metadata, user: u32) -> bool {
     meta.mode() & 0o022 != 0 || ![0, user].contains(&meta.uid())
 }
 
 /// Checks that only this user and root can change the certificate in this file.
-fn owned(file: &Path) -> Result<(), KeysError> {
+fn owned(file: &Path, user: u32) -> Result<(), KeysError> {
     let meta = fs::metadata(file).map_err(|source| io_error(file, source))?;
-    match can_be_written_by_others(&meta) {
+    match can_be_written_by_others(&meta, user) {
         true => Err(KeysError::Writable(file.to_owned())),
         false => Ok(()),
     }

@@ -72,7 +72,10 @@ fn a_revoked_certificate_cannot_be_trusted_again() {
     assert_eq!(rover.trust(&pem).unwrap(), std::slice::from_ref(&made));
     assert_eq!(rover.trust(&pem).unwrap().len(), 1, "twice is once");
     assert_ne!(rover.stamp(), before);
-    assert_eq!(rover.credentials().unwrap().trusted.len(), 1);
+    assert_eq!(
+        rover.credentials(geteuid().as_raw()).unwrap().trusted.len(),
+        1
+    );
     assert!(matches!(
         rover.revoke("unknown"),
         Err(KeysError::Which { found: 0, .. })
@@ -97,7 +100,7 @@ fn a_renewed_key_is_used_after_the_switch() {
     assert_eq!(keys.switch().unwrap(), next);
     assert_eq!(next.certified(), first.certified());
     assert_ne!(next.fingerprint(), first.fingerprint());
-    assert_eq!(keys.credentials().unwrap().own, next);
+    assert_eq!(keys.credentials(geteuid().as_raw()).unwrap().own, next);
 }
 
 /// Each call can be repeated after a cut, and what it has reported stays.
@@ -109,7 +112,7 @@ fn no_cut_of_power_leaves_unusable_keys_or_forgets_a_reported_change() {
         fs::read(keys.own_file()).unwrap()
     };
     let at = |root: &Path| Keys::at(root.join("fipa/keys"));
-    let own = |root: &Path| at(root).credentials().unwrap().own;
+    let own = |root: &Path| at(root).credentials(geteuid().as_raw()).unwrap().own;
     let init = |root: &Path| at(root).init("rover", &[], VALID).unwrap();
     let begun = |root: &Path| drop(init(root));
     let renewed = |root: &Path| drop((init(root), at(root).renew(VALID).unwrap()));
@@ -153,7 +156,7 @@ fn no_cut_of_power_leaves_unusable_keys_or_forgets_a_reported_change() {
         begun,
         |root| at(root).trust(&peer).unwrap(),
         |root, trusted| {
-            let found = at(root).credentials().unwrap().trusted;
+            let found = at(root).credentials(geteuid().as_raw()).unwrap().trusted;
             assert!(trusted.is_none_or(|trusted| *trusted == found));
             assert_eq!(at(root).trust(&peer).unwrap().len(), 1);
         },
@@ -162,7 +165,7 @@ fn no_cut_of_power_leaves_unusable_keys_or_forgets_a_reported_change() {
         trusting,
         |root| at(root).revoke("crex").unwrap(),
         |root, revoked| {
-            let credentials = at(root).credentials().unwrap();
+            let credentials = at(root).credentials(geteuid().as_raw()).unwrap();
             assert_ne!(credentials.trusted.len(), credentials.revoked.len());
             assert!(revoked.is_none() || credentials.trusted.is_empty());
         },
@@ -171,7 +174,7 @@ fn no_cut_of_power_leaves_unusable_keys_or_forgets_a_reported_change() {
         trusting,
         |root| at(root).distrust("crex").unwrap(),
         |root, ended| {
-            let trusted = at(root).credentials().unwrap().trusted;
+            let trusted = at(root).credentials(geteuid().as_raw()).unwrap().trusted;
             assert!(ended.is_none() || trusted.is_empty());
         },
     );
@@ -212,7 +215,7 @@ fn a_directory_that_other_users_can_write_is_refused() {
     for dir in [rover.dir().to_owned(), rover.dir().join("trusted")] {
         for (mode, fits) in [(0o777, false), (0o770, false), (0o755, true)] {
             fs::set_permissions(&dir, fs::Permissions::from_mode(mode)).unwrap();
-            let used = rover.credentials();
+            let used = rover.credentials(geteuid().as_raw());
             let refused = matches!(used, Err(KeysError::Writable(it)) if it == dir);
             assert_eq!(refused, !fits, "{mode:o}");
         }
@@ -227,7 +230,10 @@ fn a_key_that_other_users_can_read_is_refused() {
     let file = keys.dir().join("own.key");
     assert_eq!(fs::metadata(&file).unwrap().mode() & 0o777, 0o600);
     fs::set_permissions(&file, fs::Permissions::from_mode(0o640)).unwrap();
-    assert!(matches!(keys.credentials(), Err(KeysError::Readable(_))));
+    assert!(matches!(
+        keys.credentials(geteuid().as_raw()),
+        Err(KeysError::Readable(_))
+    ));
 }
 
 #[test]
@@ -296,14 +302,83 @@ fn a_certificate_that_other_users_can_write_is_not_trusted() {
     for mode in [0o664, 0o646] {
         chmod(mode);
         assert!(matches!(rover.trusted(), Err(KeysError::Writable(path)) if path == file));
-        assert!(rover.credentials().is_err());
+        assert!(rover.credentials(geteuid().as_raw()).is_err());
         let (confirmed, unconfirmed) = rover.confirmed();
         assert_eq!((confirmed.len(), unconfirmed.len()), (0, 1));
     }
     chmod(0o644);
     assert_eq!(rover.trusted().unwrap(), std::slice::from_ref(&made));
-    if rustix::process::geteuid().is_root() {
+    if geteuid().is_root() {
         std::os::unix::fs::chown(&file, Some(65_534), None).unwrap();
         assert!(matches!(rover.trusted(), Err(KeysError::Writable(_))));
     }
+}
+
+/// An operator makes the keys of a service with `sudo`.
+#[test]
+#[allow(clippy::print_stderr, reason = "a skipped test says so")]
+fn what_root_creates_in_a_directory_of_another_user_belongs_to_that_user() {
+    use std::os::unix::fs::{PermissionsExt as _, chown};
+
+    if !geteuid().is_root() {
+        let in_ci = std::env::var("CI").as_deref() == Ok("true");
+        assert!(!in_ci, "this test needs root");
+        eprintln!("SKIPPED, not a success: this test needs root");
+        return;
+    }
+    const USER: u32 = 61_234;
+    const GROUP: u32 = 61_235;
+    let (_other, crex) = keys();
+    let made = crex.init("crex", &[], VALID).unwrap();
+    assert_eq!(fs::metadata(crex.own_key()).unwrap().uid(), 0);
+    let pem = fs::read(crex.own_file()).unwrap();
+
+    let state = tempfile::tempdir().unwrap();
+    chown(state.path(), Some(USER), Some(GROUP)).unwrap();
+    let rover = Keys::at(state.path().join("fipa/keys"));
+    rover.init("rover", &[], VALID).unwrap();
+    rover.trust(&pem).unwrap();
+    assert_eq!(rover.trusted().unwrap(), std::slice::from_ref(&made));
+    rover.renew(VALID).unwrap();
+    rover.switch().unwrap();
+    rover.revoke("crex").unwrap();
+    let mut found = Vec::new();
+    let mut directories = vec![state.path().join("fipa")];
+    while let Some(directory) = directories.pop() {
+        for entry in fs::read_dir(&directory).unwrap() {
+            let path = entry.unwrap().path();
+            let meta = fs::metadata(&path).unwrap();
+            assert_eq!((meta.uid(), meta.gid()), (USER, GROUP), "{path:?}");
+            let mode = meta.permissions().mode() & 0o7777;
+            found.push((
+                path.strip_prefix(rover.dir()).unwrap_or(&path).to_owned(),
+                mode,
+            ));
+            if meta.is_dir() {
+                directories.push(path);
+            }
+        }
+    }
+    let revoked = format!("revoked/{}.pem", made.fingerprint());
+    let mut expected = vec![
+        (PathBuf::new(), 0o700),
+        ("own.key".into(), 0o600),
+        ("own.pem".into(), 0o644),
+        ("revoked".into(), 0o700),
+        (revoked.into(), 0o644),
+        ("trusted".into(), 0o700),
+    ];
+    found.sort();
+    expected.sort();
+    assert_eq!(found, expected);
+
+    // A gateway of root does not use them, because that user can change them. Commands of root examine them.
+    let refused = rover.credentials_of("rover").unwrap_err();
+    assert!(matches!(refused, KeysError::Readable(_)), "{refused}");
+    let examined = rover.examined_credentials_of("rover").unwrap();
+    assert_eq!(examined.revoked, [made.fingerprint()]);
+    let third = rover.dir().join("revoked/third.pem");
+    fs::write(&third, &pem).unwrap();
+    chown(&third, Some(USER + 1), None).unwrap();
+    assert!(matches!(rover.revoked(), Err(KeysError::Writable(path)) if path == third));
 }
