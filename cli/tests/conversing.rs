@@ -692,6 +692,16 @@ fn a_message_is_sent_at_a_rate() {
         "{error}"
     );
 
+    let mut listen = host.start(&["listen", "monitor", "--count", "3", "--json"]);
+    let numbered = ["--count", "3", "--numbered"];
+    host.run(&[&send[..], &numbered].concat()).done();
+    for number in 1..=3 {
+        let received: Value = serde_json::from_str(&listen.line()).unwrap();
+        assert_eq!(received["message"]["content"], format!("x {number}"));
+    }
+    assert_eq!(listen.end(), (Some(0), String::new()));
+    host.run(&[&send[..], &["--numbered"]].concat()).failed(2);
+
     // Without a count, until a signal.
     let _listen = host.start(&["listen", "monitor"]);
     let mut endless = host.start(&[&send[..], &["--rate", "100", "--json"]].concat());
@@ -708,6 +718,7 @@ fn a_message_is_sent_at_a_rate() {
         &["--rate", "0"][..],
         &["--count", "0"],
         &["--rate", "1", "--wait"],
+        &["--numbered", "--wait"],
     ] {
         host.run(&[&send[..], wrong].concat()).failed(2);
     }

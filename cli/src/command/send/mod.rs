@@ -57,6 +57,7 @@ Examples:
   fipa send --to echo@jade --address http://10.0.0.7:7778/acc --wait    an agent of another platform
   head -c 4096 /dev/urandom | fipa send --to camera --content-file - --json
   fipa send --to camera --content x --rate 10 --count 100
+  fipa send --to camera --content x --rate 10 --numbered
   fipa send --to 'arm_.*' -p cfp --protocol fipa-contract-net --content '(carry crate)' \\
       --wait --answers 3 --accept arm_2
 
@@ -126,6 +127,10 @@ pub(crate) struct Arguments {
     /// after the outcome of the one before]
     #[arg(long, value_name = "N", conflicts_with = "wait", value_parser = repeat::rate)]
     rate: Option<f64>,
+
+    /// With --count or --rate: append the number of the message to its content, after a space
+    #[arg(long, conflicts_with = "wait")]
+    numbered: bool,
 
     /// With --count or --rate: end after this time, for example 10s
     #[arg(long = "for", value_name = "TIME", conflicts_with = "wait",
@@ -229,12 +234,22 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
         (None, None) => None,
     };
     let is_repeated = arguments.count.is_some() || arguments.rate.is_some();
-    if arguments.time.is_some() && !is_repeated {
-        return Err(Failure::wrong_usage(
+    for (given, what, option) in [
+        (
+            arguments.time.is_some(),
             "--for limits repeated sending",
             "--for",
-            "give --rate or --count, too",
-        ));
+        ),
+        (
+            arguments.numbered,
+            "--numbered is for repeated sending",
+            "--numbered",
+        ),
+    ] {
+        if given && !is_repeated {
+            let help = "give --rate or --count, too";
+            return Err(Failure::wrong_usage(what, option, help));
+        }
     }
     if is_repeated {
         return options::block_on(repeat::send(arguments, content, &config))?;

@@ -89,7 +89,15 @@ async fn send_all(
     config: &Config,
     tally: &mut Tally,
 ) -> Result<(), Failure> {
-    let message = message(agent, arguments, content)?;
+    let numbered = |number| {
+        let mut content = content.clone();
+        if arguments.numbered {
+            content.get_or_insert_default().extend(format!(" {number}").bytes());
+        }
+        message(agent, arguments, content)
+    };
+    // Large content is shared by all copies.
+    let same = message(agent, arguments, content.clone())?;
     let deadline = arguments.deadline.unwrap_or(config.mts.deadline);
     let mut starts = arguments.rate.map(|rate| {
         // At least the resolution of the timer, which catches up.
@@ -109,7 +117,11 @@ async fn send_all(
         tokio::select! {
             Some(sent) = under_way.join_next() => tally.add(sent, arguments)?,
             () = tick(&mut starts), if !is_over && under_way.len() < most => {
-                let (number, sending) = (next, agent.send_within(message.clone(), deadline));
+                let message = match arguments.numbered {
+                    true => numbered(next)?,
+                    false => same.clone(),
+                };
+                let (number, sending) = (next, agent.send_within(message, deadline));
                 under_way.spawn(async move { (number, sending.await) });
                 next += 1;
             }
