@@ -127,6 +127,8 @@ pub mod platform;
 pub mod protocol;
 #[cfg(feature = "protocols")]
 pub mod topics;
+#[cfg(any(feature = "protocols", feature = "secure"))]
+mod wall_clock;
 
 pub use agent::delivery::{Deliveries, Delivery};
 pub use agent::incoming::Incoming;

@@ -30,8 +30,9 @@ const GATHERING: Duration = Duration::from_millis(20);
 /// Time between two attempts to join again.
 const RETRY_AFTER: Duration = Duration::from_millis(500);
 
-/// Time between two renewals of timestamps: far less than the age from which cleaners remove files.
-const RENEW_EVERY: Duration = Duration::from_secs(24 * 60 * 60);
+/// Time between two attempts to renew timestamps, which do nothing while the timestamps are young. If a program sets the
+/// clock of a host that has started in 1970, all files are old at once, and a cleaner can run minutes later.
+const RENEW_EVERY: Duration = Duration::from_secs(10 * 60);
 
 /// The parts of a process that have files in the directory of its domain.
 #[derive(Clone)]

@@ -2,7 +2,7 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime};
 
 use fipa_locking::Millis;
 use rustix::io::Errno;
@@ -13,23 +13,17 @@ use rustix::time::{
 use tokio::io::unix::AsyncFd;
 use tokio::runtime::Handle;
 
+use crate::wall_clock;
+
 /// Returns the time since the machine started, in milliseconds.
 pub(super) fn now() -> Millis {
     let elapsed = Duration::try_from(clock_gettime(ClockId::Boottime)).unwrap_or_default();
     millis(elapsed)
 }
 
-/// Date of this release, in seconds since 1970: 2026-11-01. A clock that shows an earlier time was not set.
-const RELEASED: u64 = 1_793_491_200;
-
 /// Returns the time of day in seconds since 1970, if the clock was set.
 pub(super) fn time_of_day() -> Option<u64> {
-    set_time(SystemTime::now())
-}
-
-fn set_time(now: SystemTime) -> Option<u64> {
-    let seconds = now.duration_since(UNIX_EPOCH).ok()?.as_secs();
-    (seconds > RELEASED).then_some(seconds)
+    wall_clock::set_time(SystemTime::now())
 }
 
 /// Returns a span in milliseconds.
@@ -100,16 +94,6 @@ impl Timer {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_clock_before_the_release_was_not_set() {
-        let at = |seconds| UNIX_EPOCH + Duration::from_secs(seconds);
-        assert_eq!(set_time(at(0)), None);
-        assert_eq!(set_time(UNIX_EPOCH - Duration::from_secs(1)), None);
-        assert_eq!(set_time(at(RELEASED)), None);
-        assert_eq!(set_time(at(RELEASED + 1)), Some(RELEASED + 1));
-        assert!(time_of_day().is_some(), "the clock of this machine is set");
-    }
 
     #[tokio::test]
     async fn the_timer_expires_at_the_time_that_was_set_last() {

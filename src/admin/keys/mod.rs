@@ -36,7 +36,7 @@ use rustls_pki_types::pem::PemObject as _;
 use rustls_pki_types::{CertificateDer, PrivateKeyDer};
 
 pub use self::error::KeysError;
-use crate::durable;
+use crate::{durable, wall_clock};
 
 /// Maximum size of a file, in bytes.
 const MAX_FILE: u64 = 1 << 20;
@@ -192,6 +192,9 @@ impl Keys {
     /// of the agents that the service may represent: empty means all, and a name that ends with `*`
     /// means all names with that prefix.
     ///
+    /// If the clock was not set, the validity begins at its time and ends as if the certificate was made at the release
+    /// of this program: so the certificate is also valid after the clock was set.
+    ///
     /// # Errors
     /// If keys exist already, if the directory cannot be written, or if `valid` is zero or reaches
     /// beyond the year 9999.
@@ -259,7 +262,7 @@ impl Keys {
     ) -> Result<Certificate, KeysError> {
         let failed = |error: rcgen::Error| KeysError::Make(Box::new(error));
         let now = SystemTime::now();
-        let until = now.checked_add(valid);
+        let until = wall_clock::earliest(now).checked_add(valid);
         let until =
             until.filter(|until| !valid.is_zero() && *until <= SystemTime::UNIX_EPOCH + LAST);
         let until = until.ok_or(KeysError::Validity(valid))?;

@@ -92,7 +92,9 @@ async fn send_all(
     let numbered = |number| {
         let mut content = content.clone();
         if arguments.numbered {
-            content.get_or_insert_default().extend(format!(" {number}").bytes());
+            content
+                .get_or_insert_default()
+                .extend(format!(" {number}").bytes());
         }
         message(agent, arguments, content)
     };
