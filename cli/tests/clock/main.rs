@@ -191,6 +191,8 @@ fn a_clock_that_jumps_from_1970_to_now_loses_no_letter_and_ends_no_lock_or_regis
     assert!(outcome.status.success(), "{outcome:?}");
 
     // The remaining letters took more than a lease.
+    let wants = ["lock", "bay", "--within", "1s", "--", "echo", "stolen"];
+    assert_eq!(rover.run(&wants), "");
     assert!(!holder.has_ended());
     assert!(has_service());
     // The hosts connect, without a restart.
