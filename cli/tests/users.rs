@@ -176,3 +176,40 @@ fn rules_name_users_inside() {
     let text = String::from_utf8(refused.stdout).unwrap();
     assert!(text.contains("no rule allows it"), "{text}");
 }
+
+/// `sudo -u fipa` leaves the directory as it is, and home directories are closed to other users.
+#[test]
+fn a_directory_that_the_user_cannot_search_has_no_configuration() {
+    let name = "a_directory_that_the_user_cannot_search_has_no_configuration_inside";
+    isolated(name, &["setpriv"]);
+}
+
+#[test]
+#[ignore = "runs in namespaces"]
+fn a_directory_that_the_user_cannot_search_has_no_configuration_inside() {
+    let robot = Robot::new(&[]);
+    let home = robot.host.path("home");
+    fs::create_dir_all(home.join(".config/fipa")).unwrap();
+    for file in ["fipa.toml", ".config/fipa/fipa.toml"] {
+        fs::write(home.join(file), "domain = \"of-root\"\n").unwrap();
+    }
+    let show = |mode| {
+        fs::set_permissions(&home, Permissions::from_mode(mode)).unwrap();
+        let mut command = Command::new("setpriv");
+        command.args([format!("--reuid={DRIVER}"), format!("--regid={CREW}")]);
+        command.args(["--clear-groups", "--"]).arg(&robot.program);
+        command.args(["config", "show"]).current_dir(&home);
+        Ran::from(command.env("HOME", &home).output().unwrap())
+    };
+    let shown = show(0o700).done();
+    assert!(!shown.contains("of-root"), "{shown}");
+    let shown = show(0o755).done();
+    assert!(shown.contains("of-root"), "{shown}");
+    let file = home.join("fipa.toml");
+    fs::set_permissions(&file, Permissions::from_mode(0o600)).unwrap();
+    let refused = show(0o755).failed(2);
+    assert!(
+        refused.contains("found in the current directory"),
+        "{refused}"
+    );
+}

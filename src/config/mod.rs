@@ -7,7 +7,8 @@
 //!
 //! Only the first of these files that exists is read: the one given with `--config`, the one named by
 //! `$FIPA_CONFIG`, `./fipa.toml`, `~/.config/fipa/fipa.toml`, `/etc/fipa/fipa.toml`. A named file that does not exist
-//! is an error, and so is an existing one that this user may not read. A key that is not set has its default:
+//! is an error, and so is an existing one that this user may not read. A directory that this user may not search counts
+//! as empty, unless it is that of the host. A key that is not set has its default:
 //!
 //! ```toml
 //! domain = "default"                  # processes of one domain on one host find each other

@@ -1,7 +1,7 @@
 //! The search for the configuration file.
 
 use std::env;
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
@@ -93,9 +93,12 @@ impl Sources {
         ];
         for (path, named_by) in usual {
             let Some(path) = path else { continue };
-            match read(&self.absolute(&path)) {
+            let is_of_host = self.host_dir.as_deref() == path.parent();
+            let absolute = self.absolute(&path);
+            match read(&absolute) {
                 Ok(text) => return Ok(Some(Found { path, text })),
                 Err(error) if is_absent(&error) => {}
+                Err(error) if !is_of_host && is_hidden(&absolute, &error) => {}
                 Err(source) => {
                     return Err(ConfigError::Read {
                         path,
@@ -129,6 +132,13 @@ fn is_absent(error: &io::Error) -> bool {
         error.kind(),
         io::ErrorKind::NotFound | io::ErrorKind::NotADirectory
     )
+}
+
+/// Whether this user cannot search the directory, as after `sudo -u` in the home directory of another user. Nothing in it
+/// is for this user.
+fn is_hidden(path: &Path, error: &io::Error) -> bool {
+    let is_denied = |error: &io::Error| error.kind() == io::ErrorKind::PermissionDenied;
+    is_denied(error) && fs::symlink_metadata(path).is_err_and(|error| is_denied(&error))
 }
 
 fn read(path: &Path) -> io::Result<String> {

@@ -203,6 +203,8 @@ fn a_clock_that_jumps_from_1970_to_now_loses_no_letter_and_ends_no_lock_or_regis
     let sent: Value = serde_json::from_str(&sent).unwrap();
     assert_eq!(sent["deliveries"][0]["via"], "tcp", "{sent}");
     assert_eq!(content(&far.line()), "hello");
+    // It ends its command, too.
+    holder.signal("-TERM");
 }
 
 #[test]
