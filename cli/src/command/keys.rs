@@ -181,18 +181,11 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             let certificate = certificate.map_err(|error| failed(&error, &keys))?;
             output::text(&format!(
                 "created a key and a certificate for {}\n{}\
-                 to pair it with another host, run `fipa keys pair`, or give {} to the owner of that host\n\
-                 add to the configuration:\n\n\
-                 [security]\nkeys = {:?}\n",
+                 to pair it with another host, run `fipa keys pair`, or give {} to the owner of that host\n{}",
                 escape(certificate.certified().mts()),
                 described(&certificate),
                 keys.own_file().display(),
-                // Absolute, so that it is valid in any working directory of the gateway.
-                path::absolute(keys.dir())
-                    .as_deref()
-                    .unwrap_or(keys.dir())
-                    .display()
-                    .to_string(),
+                to_configure(&keys, &config.security.keys),
             ))
         }
         Action::Pair { address, port } => match address {
@@ -247,6 +240,17 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             output::text(&format!("{done}\n{}", described(&renewed)))
         }
     }
+}
+
+/// The lines for the configuration, unless it names the directory.
+fn to_configure(keys: &Keys, configured: &str) -> String {
+    if keys.dir() == Path::new(configured) {
+        return String::new();
+    }
+    // Absolute, so that it is valid in any working directory of the gateway.
+    let dir = path::absolute(keys.dir());
+    let dir = dir.as_deref().unwrap_or(keys.dir()).display().to_string();
+    format!("add to the configuration:\n\n[security]\nkeys = {dir:?}\n")
 }
 
 /// Shows the certificates that were just trusted, with what is unusual about them.
@@ -477,6 +481,9 @@ fn failed(error: &KeysError, keys: &Keys) -> Failure {
         }
         KeysError::Missing(_) | KeysError::NoNext(_) => {
             "`fipa keys init` creates keys, `fipa keys renew` creates the next ones"
+        }
+        KeysError::Io { source, .. } if source.kind() == io::ErrorKind::PermissionDenied => {
+            "run the command with `sudo`, or as the user of this directory"
         }
         _ => "check whether this user can read and write in this directory",
     };
