@@ -1,7 +1,7 @@
 //! Whether the clock of this host was set. A host without a battery for its clock starts in 1970, until a program sets
 //! the clock.
 
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Date of this release, in seconds since 1970: 2026-11-01. A clock that shows an earlier time was not set.
 const RELEASED: u64 = 1_793_491_200;
@@ -16,11 +16,13 @@ pub(crate) fn set_time(now: SystemTime) -> Option<u64> {
 /// Returns the earliest time that it can be if a clock shows this one.
 #[cfg(feature = "secure")]
 pub(crate) fn earliest(now: SystemTime) -> SystemTime {
-    now.max(UNIX_EPOCH + Duration::from_secs(RELEASED))
+    now.max(UNIX_EPOCH + std::time::Duration::from_secs(RELEASED))
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
     #[cfg(feature = "protocols")]
