@@ -239,40 +239,6 @@ pub(crate) fn visible_in_json(document: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// The outcomes of a message, one object per receiver: `receiver`, `outcome`, `via` or `reason`, and
-/// the failed `attempts`.
-pub(crate) fn deliveries(deliveries: &Deliveries) -> Value {
-    let one = |delivery: &fipa::Delivery| {
-        let attempts = delivery.outcome.attempts().iter().map(|attempt| {
-            json!({
-                "via": attempt.via.name(),
-                "location": attempt.location.to_string(),
-                "error": attempt.error.to_string(),
-            })
-        });
-        let attempts: Vec<Value> = attempts.collect();
-        let receiver = &delivery.receiver;
-        match &delivery.outcome {
-            Outcome::Delivered { via, .. } => json!({
-                "receiver": receiver, "outcome": "delivered", "via": via.name(), "attempts": attempts,
-            }),
-            Outcome::Sent { via, .. } => json!({
-                "receiver": receiver, "outcome": "sent", "via": via.name(), "attempts": attempts,
-            }),
-            other => {
-                let reason = match other {
-                    Outcome::Failed { reason, .. } => reason.to_string(),
-                    unknown => unknown.to_string(),
-                };
-                json!({
-                    "receiver": receiver, "outcome": "failed", "reason": reason, "attempts": attempts,
-                })
-            }
-        }
-    };
-    deliveries.0.iter().map(one).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

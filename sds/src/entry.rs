@@ -3,8 +3,10 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use fipa_acl::Time;
 use fipa_transport::{Incarnation, Location, PeerId};
-use serde::{Deserialize, Serialize};
+use serde::ser::SerializeMap as _;
+use serde::{Deserialize, Serialize, Serializer};
 
 use crate::{Members, NameError, check_name, reserved_for};
 
@@ -36,6 +38,46 @@ pub struct Entry {
     pub peer: PeerId,
     /// Role: agent, gateway or coalition.
     pub role: Role,
+}
+
+/// As a JSON object: `name`, `type`, `description`, `role` (`agent`, `gateway` or `coalition`), `reach` (`local` or
+/// `remote`), `locations` as URLs, `mts`, `incarnation`, `registered` (RFC 3339), `source`; for a coalition also
+/// `members`, `leader` and `vacant`.
+impl Serialize for Entry {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let coalition = match &self.role {
+            Role::Coalition(members) => Some(members),
+            Role::Agent | Role::Gateway => None,
+        };
+        let role = match &self.role {
+            Role::Agent => "agent",
+            Role::Gateway => "gateway",
+            Role::Coalition(_) => "coalition",
+        };
+        let reach = match self.reach {
+            Reach::Local => "local",
+            Reach::Remote { .. } => "remote",
+        };
+        let locations: Vec<String> = self.locations.iter().map(ToString::to_string).collect();
+        let registered = Time::from_system_time(self.registered).ok();
+        let mut object = serializer.serialize_map(None)?;
+        object.serialize_entry("name", &self.name)?;
+        object.serialize_entry("type", &self.agent_type)?;
+        object.serialize_entry("description", &self.description)?;
+        object.serialize_entry("role", role)?;
+        object.serialize_entry("reach", reach)?;
+        object.serialize_entry("locations", &locations)?;
+        object.serialize_entry("mts", &self.mts)?;
+        object.serialize_entry("incarnation", &self.incarnation)?;
+        object.serialize_entry("registered", &registered.and_then(Time::to_rfc3339))?;
+        object.serialize_entry("source", &self.source)?;
+        if let Some(members) = coalition {
+            object.serialize_entry("members", members.names())?;
+            object.serialize_entry("leader", &members.leader())?;
+            object.serialize_entry("vacant", &members.is_vacant())?;
+        }
+        object.end()
+    }
 }
 
 impl Entry {

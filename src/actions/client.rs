@@ -343,7 +343,7 @@ impl GoalHandle<'_> {
             let was_silent = !reachability.unreachable().is_empty();
             tokio::select! {
                 biased;
-                message = self.request.finished() => break message?,
+                message = self.request.result() => break message?,
                 true = reachability.changed() => {}
             }
             if was_silent && reachability.unreachable().is_empty() {

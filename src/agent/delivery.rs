@@ -6,6 +6,8 @@ use std::sync::Arc;
 use fipa_acl::{AgentId, escape_name};
 use fipa_mts::Sending;
 use fipa_transport::{FailureReason, Outcome};
+use serde::{Serialize, Serializer};
+use serde_json::{Value, json};
 
 use crate::agent::checks::Unsettled;
 use crate::agent::stated::{Full, Waiting};
@@ -29,6 +31,35 @@ impl Deliveries {
     #[must_use]
     pub fn all_succeeded(&self) -> bool {
         self.0.iter().all(|delivery| delivery.outcome.is_success())
+    }
+}
+
+/// As a JSON array with an object per receiver: `receiver`, `outcome` (`delivered`, `sent` or `failed`), `via` or
+/// `reason`, and the failed `attempts`, each with `via`, `location` and `error`.
+impl Serialize for Deliveries {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_seq(self.0.iter().map(Delivery::to_json))
+    }
+}
+
+impl Delivery {
+    fn to_json(&self) -> Value {
+        let attempts = self.outcome.attempts().iter().map(|attempt| {
+            json!({
+                "via": attempt.via.name(),
+                "location": attempt.location.to_string(),
+                "error": attempt.error.to_string(),
+            })
+        });
+        let (outcome, key, detail) = match &self.outcome {
+            Outcome::Delivered { via, .. } => ("delivered", "via", via.name().to_owned()),
+            Outcome::Sent { via, .. } => ("sent", "via", via.name().to_owned()),
+            Outcome::Failed { reason, .. } => ("failed", "reason", reason.to_string()),
+            unknown => ("failed", "reason", unknown.to_string()),
+        };
+        json!({
+            "receiver": self.receiver, "outcome": outcome, key: detail, "attempts": attempts.collect::<Vec<_>>(),
+        })
     }
 }
 

@@ -391,11 +391,15 @@ impl Agent {
     /// Returns the next message for this agent, if one is available now.
     ///
     /// # Errors
-    /// If this process is a forked child of the one that registered the agent.
+    /// If none is available and the agent can receive no further message; see [`receive`](Self::receive).
     pub fn try_receive(&self) -> Result<Option<Incoming>, ReceiveError> {
-        self.core.endpoint.domain.inner.owner.check()?;
-        self.core.endpoint.mts().drive();
-        self.core.demultiplexer.other_now(&self.core.endpoint)
+        let endpoint = &self.core.endpoint;
+        endpoint.domain.inner.owner.check()?;
+        endpoint.mts().drive();
+        match self.core.demultiplexer.other_now(endpoint)? {
+            None if endpoint.mts().is_gone(endpoint.incarnation) => Err(ReceiveError::Closed),
+            received => Ok(received),
+        }
     }
 
     /// Removes the name from the directory, and returns the messages that were delivered but not

@@ -34,15 +34,19 @@ struct Claim {
 
 impl Claim {
     /// Waits until the claim has another state than `state`. Returns the error unless it is held.
-    async fn after(&self, state: ClaimState) -> Result<(), LockError> {
+    fn after(&self, state: ClaimState) -> impl Future<Output = Result<(), LockError>> + use<> {
         let mut changes = self.state.clone();
-        let changed = changes.wait_for(|now| *now != state).await;
-        let now = changed.map_or(ClaimState::Closed, |now| now.clone());
-        match now {
-            ClaimState::Waiting | ClaimState::Held => Ok(()),
-            ClaimState::Failed { resource, failure } => Err(LockError::failed(&resource, failure)),
-            ClaimState::Lost { resource } => Err(LockError::lost(&resource)),
-            ClaimState::Closed => Err(LockError::Closed),
+        async move {
+            let changed = changes.wait_for(|now| *now != state).await;
+            let now = changed.map_or(ClaimState::Closed, |now| now.clone());
+            match now {
+                ClaimState::Waiting | ClaimState::Held => Ok(()),
+                ClaimState::Failed { resource, failure } => {
+                    Err(LockError::failed(&resource, failure))
+                }
+                ClaimState::Lost { resource } => Err(LockError::lost(&resource)),
+                ClaimState::Closed => Err(LockError::Closed),
+            }
         }
     }
 }
@@ -143,7 +147,7 @@ impl Lock {
     }
 
     /// Waits until the lock is lost, and returns the reason: [`LockError::Lost`] or
-    /// [`LockError::Closed`].
+    /// [`LockError::Closed`]. The future does not keep the lock: it also ends when the lock is released.
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -156,11 +160,14 @@ impl Lock {
     /// # Ok(())
     /// # }
     /// ```
-    pub async fn lost(&self) -> LockError {
-        match self.claim.after(ClaimState::Held).await {
-            Err(error) => error,
-            // Cannot happen: a claim that was held never waits again.
-            Ok(()) => LockError::Closed,
+    pub fn lost(&self) -> impl Future<Output = LockError> + Send + use<> {
+        let after = self.claim.after(ClaimState::Held);
+        async move {
+            match after.await {
+                Err(error) => error,
+                // Cannot happen: a claim that was held never waits again.
+                Ok(()) => LockError::Closed,
+            }
         }
     }
 

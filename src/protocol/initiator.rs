@@ -216,13 +216,8 @@ impl Request {
     ///
     /// # Errors
     /// If the other side refuses, fails, is gone, or does not answer in time, or if the request was
-    /// cancelled ([`DialogueError::Cancelled`]).
-    pub async fn result(mut self) -> Result<Message, DialogueError> {
-        self.finished().await
-    }
-
-    /// Waits for the result like [`result`](Self::result). Dropping the future loses no message.
-    pub(crate) async fn finished(&mut self) -> Result<Message, DialogueError> {
+    /// cancelled ([`DialogueError::Cancelled`]). Dropping the future loses no message, and the next call waits on.
+    pub async fn result(&mut self) -> Result<Message, DialogueError> {
         loop {
             if let Some(end) = &self.end {
                 return end.clone().into_result();

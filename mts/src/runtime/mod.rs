@@ -578,6 +578,14 @@ impl Mts {
         }
     }
 
+    /// Whether no more letters can arrive for this agent, because it was deregistered or the service closed.
+    #[must_use]
+    pub fn is_gone(&self, agent: Incarnation) -> bool {
+        let state = self.shared.lock();
+        let waiter = state.agents.get(&agent);
+        waiter.is_none_or(|waiter| waiter.gone.load(Ordering::Acquire))
+    }
+
     /// Returns the next letter for this agent if there is one.
     pub fn try_receive(&self, agent: Incarnation) -> Option<Received> {
         let mut state = self.shared.lock();

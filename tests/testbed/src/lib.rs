@@ -65,19 +65,8 @@ const WATCHDOG: &str = "900";
 /// # Panics
 /// If the test fails, or if it cannot run and `CI=true`.
 pub fn isolated(name: &str, tools: &[&str]) {
-    let needed = ["ip", "mount", "timeout", "unshare"].iter().chain(tools);
-    let mut missing: Vec<&str> = needed
-        .copied()
-        .filter(|tool| find(tool).is_none())
-        .collect();
-    if !rustix::process::geteuid().is_root() {
-        missing.push("root");
-    }
-    if !missing.is_empty() {
-        let missing = missing.join(", ");
-        let in_ci = std::env::var("CI").as_deref() == Ok("true");
-        assert!(!in_ci, "missing for {name}: {missing}");
-        eprintln!("SKIPPED, not a success: {name} needs {missing}");
+    let needed = [&["ip", "mount", "timeout", "unshare"], tools].concat();
+    if !can_run(name, &needed, rustix::process::geteuid().is_root()) {
         return;
     }
     // The program under test may be below /tmp, so /tmp is not replaced by a mount.
@@ -96,6 +85,26 @@ pub fn isolated(name: &str, tools: &[&str]) {
         .status()
         .unwrap();
     assert!(status.success(), "{name} failed; see above");
+}
+
+/// Whether the test `name` can run: all `tools` are there, and it has the permission that it needs. If not, prints a
+/// note, or panics if `CI=true`.
+///
+/// # Panics
+/// If the test cannot run and `CI=true`.
+#[must_use]
+pub fn can_run(name: &str, tools: &[&str], is_permitted: bool) -> bool {
+    let missing = tools.iter().copied().filter(|tool| find(tool).is_none());
+    let root = (!is_permitted).then_some("root");
+    let missing: Vec<&str> = missing.chain(root).collect();
+    if missing.is_empty() {
+        return true;
+    }
+    let missing = missing.join(", ");
+    let in_ci = std::env::var("CI").as_deref() == Ok("true");
+    assert!(!in_ci, "missing for {name}: {missing}");
+    eprintln!("SKIPPED, not a success: {name} needs {missing}");
+    false
 }
 
 /// Prepares the namespaces that [`isolated`] has created: mounts an empty `/run`, an empty `/dev/shm` and

@@ -401,21 +401,11 @@ impl Row {
                 None => "an unknown gateway".to_owned(),
             }),
         };
-        let locations = at.iter().map(ToString::to_string);
-        let locations: Vec<String> = locations.collect();
-        let registered = Time::from_system_time(entry.registered);
-        let mut json = json!({
-            "name": entry.name,
-            "type": entry.agent_type,
-            "description": entry.description,
-            "role": role(&entry.role),
-            "reach": if through.is_none() { "local" } else { "remote" },
-            "locations": locations,
-            "mts": entry.mts,
-            "incarnation": entry.incarnation,
-            "registered": registered.ok().and_then(Time::to_rfc3339),
-            "source": entry.source,
-        });
+        let mut json = json!(entry);
+        if own.is_some() {
+            let locations: Vec<String> = at.iter().map(ToString::to_string).collect();
+            json["locations"] = json!(locations);
+        }
         let stopped = StoppedAgent::of(entry).map(|it| it.process);
         if let Some(process) = stopped {
             json["stopped"] = process.into();
@@ -434,9 +424,6 @@ impl Row {
         }
         let locations: Vec<String> = match &entry.role {
             Role::Coalition(members) => {
-                json["members"] = json!(members.names());
-                json["leader"] = json!(members.leader());
-                json["vacant"] = json!(members.is_vacant());
                 let is_leader =
                     |name: &Arc<str>| members.leader().is_some_and(|leader| leader == name);
                 let names = members.names().iter();
@@ -555,15 +542,6 @@ fn gateway(directory: DirectoryView<'_>) -> Option<Arc<Entry>> {
         .iter()
         .filter(|entry| entry.role == Role::Gateway && entry.reach == Reach::Local);
     gateways.next().cloned()
-}
-
-fn role(role: &Role) -> &'static str {
-    match role {
-        Role::Agent => "agent",
-        Role::Gateway => "gateway",
-        Role::Coalition(_) => "coalition",
-        _ => "?",
-    }
 }
 
 fn source(source: Source) -> &'static str {

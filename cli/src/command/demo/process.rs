@@ -358,7 +358,7 @@ fn id(name: &str) -> Result<AgentId, String> {
 
 fn outcomes(deliveries: &Deliveries) -> Result<Event, String> {
     Ok(Event::Outcomes {
-        deliveries: output::deliveries(deliveries),
+        deliveries: serde_json::to_value(deliveries).unwrap_or_default(),
     })
 }
 

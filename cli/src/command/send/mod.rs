@@ -385,7 +385,7 @@ async fn converse(
         settled = settle::proposals(agent, &message, &answers, arguments).await?;
     }
     if arguments.json {
-        let mut json = json!({ "deliveries": output::deliveries(&deliveries) });
+        let mut json = json!({ "deliveries": deliveries });
         let mut replies = answers
             .replies
             .iter()

@@ -1,0 +1,359 @@
+//! Agents: registering, sending, loans, receiving.
+
+use std::time::Duration;
+
+use fipa::blocking::Wait;
+use fipa::error::SendError;
+use fipa::{Agent, Deliveries, Incoming, Loan, MessageBuilder, RegisterOptions};
+use futures_util::stream::unfold;
+use parking_lot::Mutex;
+
+use crate::domain::{Membership, Text};
+use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::item::{Event, Items, OperationHandle, failed, outcome};
+use crate::message::{Draft, FipaMessage, Letter, LetterRef};
+use crate::raw::{Extensible, FipaText, Readable, limit, put, structure, writable};
+use crate::table::{self, FipaHandle};
+
+/// Length of a content in bytes from which it is copied into memory that the receivers read in place.
+const IN_PLACE: usize = 4_096;
+
+/// The description of an agent in the directory. A field that is zero is not set.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct FipaAgentOptions {
+    /// sizeof(struct fipa_agent_options).
+    pub size: usize,
+    /// The kind of agent, for searches.
+    pub agent_type: FipaText,
+    /// Free text.
+    pub description: FipaText,
+}
+
+// SAFETY: It begins with a `usize`.
+unsafe impl Extensible for FipaAgentOptions {}
+// SAFETY: Its fields are pointers and numbers.
+unsafe impl Readable for FipaAgentOptions {}
+
+/// An agent, with the queue of its domain.
+pub(crate) struct OwnAgent {
+    pub(crate) agent: Agent,
+    pub(crate) items: Items,
+}
+
+/// Registers an agent. `options` may be NULL. `fipa_close` deregisters it, and what it has not received is dropped.
+///
+/// # Safety
+/// The texts must be readable. `agent` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_register(
+    domain: FipaHandle,
+    name: FipaText,
+    options: *const FipaAgentOptions,
+    agent: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(agent, "the handle")?;
+        let membership = table::get::<Membership>(domain)?;
+        // SAFETY: The caller promises it.
+        let name = unsafe { name.required("the name") }?;
+        let mut described = RegisterOptions::default();
+        if !options.is_null() {
+            // SAFETY: The caller promises it.
+            let options = unsafe { structure(options, "the options") }?;
+            // SAFETY: The caller promises it.
+            let agent_type = unsafe { options.agent_type.read("the agent_type") }?;
+            // SAFETY: The caller promises it.
+            let description = unsafe { options.description.read("the description") }?;
+            described.agent_type = agent_type.unwrap_or_default().to_owned();
+            described.description = description.unwrap_or_default().to_owned();
+        }
+        let registered = membership.domain.register_with(name, described).wait();
+        let own = OwnAgent {
+            agent: registered.or_fail()?,
+            items: membership.items.clone(),
+        };
+        // SAFETY: The caller promises it.
+        unsafe { put(agent, table::add(own), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+type Sending = Box<dyn Future<Output = Result<Deliveries, SendError>> + Send + Unpin>;
+
+/// Sends a message; the letters leave in the order of the calls. The deadline of the configuration applies if
+/// `within` is `None`.
+fn send(
+    agent: &Agent,
+    draft: &Draft<'_>,
+    builder: MessageBuilder,
+    within: Option<Duration>,
+) -> Result<Sending, Failure> {
+    let content = draft.content().filter(|content| content.len() >= IN_PLACE);
+    let Some(content) = content else {
+        let message = draft.with_content(builder)?;
+        return Ok(match within {
+            Some(within) => Box::new(Box::pin(agent.send_within(message, within))),
+            None => Box::new(Box::pin(agent.send(message))),
+        });
+    };
+    let mut loan = agent
+        .loan(draft.complete(builder)?, content.len())
+        .or_fail()?;
+    loan.content_mut().copy_from_slice(content);
+    Ok(send_loan(agent, loan, within))
+}
+
+fn send_loan(agent: &Agent, loan: Loan, within: Option<Duration>) -> Sending {
+    match within {
+        Some(within) => Box::new(Box::pin(agent.send_loan_within(loan, within))),
+        None => Box::new(Box::pin(agent.send_loan(loan))),
+    }
+}
+
+/// Waits for the outcomes, and writes them for the caller.
+///
+/// # Safety
+/// `outcomes` is NULL or can be written.
+unsafe fn settle(sending: Sending, outcomes: *mut FipaHandle) -> Result<FipaResult, Failure> {
+    let deliveries = sending.wait().or_fail()?;
+    if !outcomes.is_null() {
+        // SAFETY: The caller promises it.
+        unsafe {
+            put(
+                outcomes,
+                table::add(Text::json(&deliveries)?),
+                "the outcomes",
+            )
+        }?;
+    }
+    Ok(outcome(&deliveries))
+}
+
+/// An operation that ends with the outcomes.
+async fn outcomes_of(sending: Sending) -> Event {
+    match sending.await {
+        Ok(outcomes) => Event::Outcomes(outcomes),
+        Err(error) => failed(Failure::of(error)),
+    }
+}
+
+/// Sends a message, and waits until each receiver has an outcome: at most `timeout_ms`, or the deadline of the
+/// configuration (`mts.deadline`) if it is negative. Letters leave in the order of the calls.
+///
+/// The result is `FIPA_RESULT_NOT_DELIVERED` if a receiver has not got the letter; `fipa_error` lists the outcomes. With
+/// `outcomes`, the caller gets them as JSON (`fipa_read_text`): an array with an object per receiver, with `receiver`,
+/// `outcome` (`delivered`, `sent` or `failed`), `via` or `reason`, and the failed `attempts`.
+///
+/// # Safety
+/// `message` is NULL or as its documentation says. `outcomes` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_send(
+    agent: FipaHandle,
+    message: *const FipaMessage,
+    timeout_ms: i64,
+    outcomes: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        let own = table::get::<OwnAgent>(agent)?;
+        // SAFETY: The caller promises it.
+        let draft = unsafe { Draft::read(message) }?;
+        let builder = own.agent.message(draft.performative(None)?);
+        let sending = send(&own.agent, &draft, builder, limit(timeout_ms))?;
+        // SAFETY: The caller promises it.
+        unsafe { settle(sending, outcomes) }
+    })
+}
+
+/// Sends a message as `fipa_send`, without waiting. The outcomes are an item of the kind `FIPA_EVENT_OUTCOMES`.
+///
+/// # Safety
+/// `message` is NULL or as its documentation says.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_begin_send(
+    agent: FipaHandle,
+    message: *const FipaMessage,
+    timeout_ms: i64,
+    tag: u64,
+) -> FipaResult {
+    call(|| {
+        let own = table::get::<OwnAgent>(agent)?;
+        // SAFETY: The caller promises it.
+        let draft = unsafe { Draft::read(message) }?;
+        let builder = own.agent.message(draft.performative(None)?);
+        let sending = send(&own.agent, &draft, builder, limit(timeout_ms))?;
+        own.items.begin(tag, outcomes_of(sending));
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Sends an answer to a letter, as `fipa_send`: to its `reply_to` or its sender, in the same conversation and
+/// protocol. What `message` sets takes precedence.
+///
+/// # Safety
+/// As for `fipa_send`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_answer(
+    agent: FipaHandle,
+    letter: FipaHandle,
+    message: *const FipaMessage,
+    timeout_ms: i64,
+    outcomes: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        let own = table::get::<OwnAgent>(agent)?;
+        let letter = LetterRef::of(letter)?;
+        // SAFETY: The caller promises it.
+        let draft = unsafe { Draft::read(message) }?;
+        let builder = own
+            .agent
+            .reply(letter.get()?.message(), draft.performative(None)?);
+        let sending = send(&own.agent, &draft, builder, limit(timeout_ms))?;
+        // SAFETY: The caller promises it.
+        unsafe { settle(sending, outcomes) }
+    })
+}
+
+/// A loan that the caller writes and sends.
+pub(crate) struct OpenLoan {
+    agent: Agent,
+    items: Items,
+    loan: Mutex<Option<Loan>>,
+}
+
+impl OpenLoan {
+    fn take(&self) -> Result<Loan, Failure> {
+        let loan = self.loan.lock().take();
+        loan.ok_or_else(|| Failure::new(FipaResult::BadHandle, "the loan was sent"))
+    }
+}
+
+/// Loans memory of `len` bytes for the content of a message, in shared memory where possible: receivers on this host
+/// read in place what the caller writes. The content of `message` is ignored. The memory is valid until the loan is
+/// sent or closed.
+///
+/// # Safety
+/// `message` is NULL or as its documentation says. `loan` and `content` are NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_loan(
+    agent: FipaHandle,
+    message: *const FipaMessage,
+    len: usize,
+    loan: *mut FipaHandle,
+    content: *mut *mut u8,
+) -> FipaResult {
+    call(|| {
+        writable(loan, "the handle")?;
+        writable(content, "the content")?;
+        let own = table::get::<OwnAgent>(agent)?;
+        // SAFETY: The caller promises it.
+        let draft = unsafe { Draft::read(message) }?;
+        let builder = draft.complete(own.agent.message(draft.performative(None)?))?;
+        let mut loaned = own.agent.loan(builder, len).or_fail()?;
+        let memory = loaned.content_mut().as_mut_ptr();
+        let open = OpenLoan {
+            agent: own.agent.clone(),
+            items: own.items.clone(),
+            loan: Mutex::new(Some(loaned)),
+        };
+        // SAFETY: The caller promises it.
+        unsafe { put(content, memory, "the content") }?;
+        // SAFETY: The caller promises it.
+        unsafe { put(loan, table::add(open), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Sends a loan as `fipa_send`. Its handle is closed, and the caller no longer writes the memory.
+///
+/// # Safety
+/// `outcomes` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_send_loan(
+    loan: FipaHandle,
+    timeout_ms: i64,
+    outcomes: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        let open = table::get::<OpenLoan>(loan)?;
+        let taken = open.take()?;
+        drop(table::remove(loan));
+        let sending = send_loan(&open.agent, taken, limit(timeout_ms));
+        // SAFETY: The caller promises it.
+        unsafe { settle(sending, outcomes) }
+    })
+}
+
+/// Sends a loan as `fipa_send_loan`, without waiting. The outcomes are an item of the kind `FIPA_EVENT_OUTCOMES`.
+#[unsafe(no_mangle)]
+pub extern "C" fn fipa_begin_send_loan(loan: FipaHandle, timeout_ms: i64, tag: u64) -> FipaResult {
+    call(|| {
+        let open = table::get::<OpenLoan>(loan)?;
+        let taken = open.take()?;
+        drop(table::remove(loan));
+        let sending = send_loan(&open.agent, taken, limit(timeout_ms));
+        open.items.begin(tag, outcomes_of(sending));
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Waits for the next letter of an agent, up to `timeout_ms`, or without a limit if it is negative. Returns `FIPA_RESULT_EMPTY` if
+/// none has arrived. The caller closes the letter.
+///
+/// # Safety
+/// `letter` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_receive(
+    agent: FipaHandle,
+    timeout_ms: i64,
+    letter: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(letter, "the handle")?;
+        let own = table::get::<OwnAgent>(agent)?;
+        let received: Option<Incoming> = match limit(timeout_ms) {
+            Some(Duration::ZERO) => own.agent.try_receive().or_fail()?,
+            Some(limit) => own
+                .agent
+                .receive()
+                .wait_within(limit)
+                .transpose()
+                .or_fail()?,
+            None => Some(own.agent.receive().wait().or_fail()?),
+        };
+        let Some(received) = received else {
+            return Ok(FipaResult::Empty);
+        };
+        // SAFETY: The caller promises it.
+        unsafe { put(letter, table::add(Letter::from(received)), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Makes the letters of an agent items of the kind `FIPA_EVENT_LETTER`. They wait in the queue of the agent until `fipa_next`
+/// takes them. Closing the operation ends it, and no letter is lost.
+///
+/// # Safety
+/// `operation` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_listen(
+    agent: FipaHandle,
+    tag: u64,
+    operation: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(operation, "the handle")?;
+        let own = table::get::<OwnAgent>(agent)?;
+        let letters = unfold(Some(own.agent.clone()), |agent| async move {
+            let agent = agent?;
+            match agent.receive().await {
+                Ok(letter) => Some((Event::Letter(letter.into()), Some(agent))),
+                Err(error) => Some((failed(Failure::of(error)), None)),
+            }
+        });
+        let began = OperationHandle::of(own.items.follow(tag, letters));
+        // SAFETY: The caller promises it.
+        unsafe { put(operation, table::add(began), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}

@@ -1,0 +1,239 @@
+//! Domains: joining, the directory, and the routes.
+
+use std::path::PathBuf;
+
+use fipa::blocking::{self, Wait};
+use fipa::config::Sources;
+use fipa::error::DeregisterError;
+use fipa::{Change, Config, Domain, Matcher, Query};
+use futures_util::StreamExt as _;
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use crate::agent::OwnAgent;
+use crate::conversation::OpenServer;
+use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::item::{Event, Items, OperationHandle, failed};
+use crate::raw::{Extensible, FipaText, Readable, put, structure, texts, writable};
+use crate::table::{self, FipaHandle};
+
+/// How a process joins a domain. A field that is zero is not set.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct FipaDomainOptions {
+    /// sizeof(struct fipa_domain_options).
+    pub size: usize,
+    /// The configuration file. Without it, the file that the environment selects: `$FIPA_CONFIG`, else `./fipa.toml`,
+    /// else `~/.config/fipa/fipa.toml`, else `/etc/fipa/fipa.toml`, else the defaults.
+    pub config: FipaText,
+    /// Values that override the file, each as `key=value`, for example `domain=test`.
+    pub set: *const FipaText,
+    /// Number of these values.
+    pub set_count: usize,
+}
+
+// SAFETY: It begins with a `usize`.
+unsafe impl Extensible for FipaDomainOptions {}
+// SAFETY: Its fields are pointers and numbers.
+unsafe impl Readable for FipaDomainOptions {}
+
+/// The membership of this process in a domain, and the queue of what it waits for.
+pub(crate) struct Membership {
+    pub(crate) domain: Domain,
+    pub(crate) items: Items,
+}
+
+/// A text that the caller reads.
+pub(crate) struct Text(String);
+
+impl Text {
+    pub(crate) fn json(value: &impl Serialize) -> Result<Self, Failure> {
+        let text = serde_json::to_string(value);
+        let text = text.map_err(|error| Failure::new(FipaResult::Failed, error.to_string()));
+        text.map(Self)
+    }
+}
+
+/// Joins a domain: that of the environment if `options` is NULL. `fipa_close` leaves it.
+///
+/// # Safety
+/// `options` is NULL or as its documentation says. `domain` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_open(
+    options: *const FipaDomainOptions,
+    domain: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(domain, "the handle")?;
+        let mut sources = Sources::from_environment();
+        if !options.is_null() {
+            // SAFETY: The caller promises it.
+            let options = unsafe { structure(options, "the options") }?;
+            // SAFETY: The caller promises it.
+            let config = unsafe { options.config.read("the config") }?;
+            if let Some(config) = config.filter(|config| !config.is_empty()) {
+                sources.file = Some(PathBuf::from(config));
+            }
+            // SAFETY: The caller promises it.
+            let set = unsafe { texts(options.set, options.set_count, "a value in set") }?;
+            sources.set = set.into_iter().map(str::to_owned).collect();
+        }
+        blocking::start().or_fail()?;
+        let opened = Domain::open(&Config::load(&sources).or_fail()?)
+            .wait()
+            .or_fail()?;
+        async { opened.follow(sources) }.wait();
+        let membership = Membership {
+            domain: opened,
+            items: Items::new(),
+        };
+        // SAFETY: The caller promises it.
+        unsafe { put(domain, table::add(membership), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Returns the known agents of this host and of others as a JSON array, with the text as a handle
+/// (`fipa_read_text`). `pattern` and `agent_type` may be empty; each is a name or a pattern for the whole text.
+///
+/// Each object has `name`, `type`, `description`, `role`, `reach` (`local` or `remote`), `locations`, `mts`,
+/// `incarnation`, `registered` and `source`.
+///
+/// # Safety
+/// The texts must be readable. `agents` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_agents(
+    domain: FipaHandle,
+    pattern: FipaText,
+    agent_type: FipaText,
+    agents: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(agents, "the handle")?;
+        let membership = table::get::<Membership>(domain)?;
+        let query = Query {
+            // SAFETY: The caller promises it.
+            name: matcher(unsafe { pattern.read("the pattern") }?)?,
+            // SAFETY: The caller promises it.
+            agent_type: matcher(unsafe { agent_type.read("the agent_type") }?)?,
+            ..Query::all()
+        };
+        let mut found = membership.domain.agents();
+        found.retain(|entry| query.matches(entry));
+        // SAFETY: The caller promises it.
+        unsafe { put(agents, table::add(Text::json(&found)?), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+fn matcher(text: Option<&str>) -> Result<Option<Matcher>, Failure> {
+    let text = text.filter(|text| !text.is_empty());
+    text.map(Matcher::parse).transpose().or_fail()
+}
+
+/// Reports the routes of letters to the agents of a pattern (empty: to all) as JSON, with the text as a handle.
+///
+/// # Safety
+/// As for `fipa_agents`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_routes(
+    domain: FipaHandle,
+    pattern: FipaText,
+    routes: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(routes, "the handle")?;
+        let membership = table::get::<Membership>(domain)?;
+        let query = Query {
+            // SAFETY: The caller promises it.
+            name: matcher(unsafe { pattern.read("the pattern") }?)?,
+            ..Query::all()
+        };
+        let report = membership.domain.routes(&query);
+        // SAFETY: The caller promises it.
+        unsafe { put(routes, table::add(Text::json(&report)?), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Follows the directory: each agent that joins, changes or leaves is an item of the kind `FIPA_EVENT_CHANGE`, with a JSON text.
+/// Its `change` is `joined`, `changed` or `left`, and `agent` is as in `fipa_agents`. It is `lagged`, without an agent,
+/// if the program was too slow and has missed changes. Closing the operation ends it.
+///
+/// # Safety
+/// `operation` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_follow_agents(
+    domain: FipaHandle,
+    tag: u64,
+    operation: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(operation, "the handle")?;
+        let membership = table::get::<Membership>(domain)?;
+        let changes = membership.domain.changes().flat_map(|change| {
+            let mut all = Vec::new();
+            flatten(&change, &mut all);
+            let events = all.into_iter().map(|json| match Text::json(&json) {
+                Ok(text) => Event::Change(text),
+                Err(failure) => failed(failure),
+            });
+            futures_util::stream::iter(events.collect::<Vec<_>>())
+        });
+        let began = OperationHandle::of(membership.items.follow(tag, changes));
+        // SAFETY: The caller promises it.
+        unsafe { put(operation, table::add(began), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Lists changes that took effect at once one by one.
+fn flatten(change: &Change, all: &mut Vec<Value>) {
+    match change {
+        Change::Joined(entry) => all.push(json!({ "change": "joined", "agent": entry })),
+        Change::Changed { after, .. } => all.push(json!({ "change": "changed", "agent": after })),
+        Change::Left(entry) => all.push(json!({ "change": "left", "agent": entry })),
+        Change::Lagged => all.push(json!({ "change": "lagged" })),
+        Change::Together(changes) => changes.iter().for_each(|change| flatten(change, all)),
+    }
+}
+
+/// Returns the text of a handle, until it is closed.
+///
+/// # Safety
+/// `text` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_read_text(handle: FipaHandle, text: *mut FipaText) -> FipaResult {
+    call(|| {
+        let own = table::get::<Text>(handle)?;
+        // SAFETY: The caller promises it.
+        unsafe { put(text, FipaText::of(&own.0), "the text") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Closes a handle of any kind. What was read from it is no longer valid.
+///
+/// A domain is left, and letters in transit get one second; an agent is deregistered; a lock is released; a task that
+/// has no answer fails; an operation ends, without a further item; an open loan is dropped.
+#[unsafe(no_mangle)]
+pub extern "C" fn fipa_close(handle: FipaHandle) -> FipaResult {
+    call(|| {
+        let object = table::remove(handle)?;
+        if let Some(membership) = object.downcast_ref::<Membership>() {
+            membership.domain.clone().close().wait();
+        } else if let Some(operation) = object.downcast_ref::<OperationHandle>() {
+            operation.end();
+        } else if let Some(server) = object.downcast_ref::<OpenServer>() {
+            server.end();
+        } else if let Some(own) = object.downcast_ref::<OwnAgent>() {
+            // Operations hold further handles of the agent.
+            match own.agent.clone().deregister() {
+                // The domain was closed before, which has deregistered the agent.
+                Ok(_) | Err(DeregisterError::Closed) => {}
+                Err(error) => return Err(Failure::of(error)),
+            }
+        }
+        Ok(FipaResult::Ok)
+    })
+}

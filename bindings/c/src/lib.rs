@@ -1,0 +1,37 @@
+#![doc = include_str!("../README.md")]
+
+mod agent;
+mod conversation;
+mod domain;
+mod failure;
+mod fork;
+mod item;
+mod locks;
+mod message;
+mod raw;
+mod table;
+mod topics;
+
+pub use crate::agent::*;
+pub use crate::conversation::*;
+pub use crate::domain::*;
+pub use crate::failure::FipaResult;
+pub use crate::item::*;
+pub use crate::locks::*;
+pub use crate::message::*;
+pub use crate::raw::{FipaBytes, FipaText};
+pub use crate::table::FipaHandle;
+pub use crate::topics::*;
+
+/// Returns the version of the library, such as `0.1.0`.
+#[unsafe(no_mangle)]
+pub extern "C" fn fipa_version() -> FipaText {
+    FipaText::of(env!("CARGO_PKG_VERSION"))
+}
+
+/// Returns the text of the last failure of this thread: what went wrong, where, and what to do. It is valid until the
+/// next failure of this thread, and empty if none has failed.
+#[unsafe(no_mangle)]
+pub extern "C" fn fipa_error() -> FipaText {
+    failure::last()
+}

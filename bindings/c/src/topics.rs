@@ -1,0 +1,259 @@
+//! Topics: publishing and subscribing.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa::blocking::Wait;
+use fipa::protocol::{DialogueError, Keep, Subscription};
+use fipa::topics::{Publisher, Topic, TopicLoan};
+use fipa::{Agent, MessageBuilder, Performative};
+use futures_core::Stream;
+use futures_util::stream::unfold;
+use parking_lot::Mutex;
+
+use crate::agent::OwnAgent;
+use crate::conversation::copied;
+use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::item::{Event, OperationHandle, failed};
+use crate::message::{Draft, FipaMessage, Letter};
+use crate::raw::{Extensible, FipaBytes, FipaText, Readable, limit, put, structure, writable};
+use crate::table::{self, FipaHandle};
+
+/// Time for the answer to a subscription, if the caller sets none.
+const TIMEOUT: Duration = Duration::from_secs(30);
+
+/// A topic. A field that is zero is not set.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct FipaTopic {
+    /// sizeof(struct fipa_topic).
+    pub size: usize,
+    /// The name.
+    pub name: FipaText,
+    /// The media type of the contents, such as `image/jpeg`, for users.
+    pub media_type: FipaText,
+    /// Notifications per second. The topic is then a stream: subscribers get the newest notification unless they ask
+    /// for others.
+    pub rate: f64,
+    /// Number of the newest contents that a new subscriber gets at once, at most 64.
+    pub latched: usize,
+}
+
+// SAFETY: It begins with a `usize`.
+unsafe impl Extensible for FipaTopic {}
+// SAFETY: Its fields are pointers and numbers.
+unsafe impl Readable for FipaTopic {}
+
+/// A publisher. Calls share it with the loans that were not published yet.
+struct OpenPublisher(Publisher);
+
+/// A loan of a publisher.
+struct OpenTopicLoan {
+    publisher: Arc<OpenPublisher>,
+    loan: Mutex<Option<TopicLoan>>,
+}
+
+/// Publishes a topic: accepts the subscriptions whose content is its name (FIPA00035). `fipa_close` ends it.
+///
+/// # Safety
+/// `topic` is NULL or as its documentation says. `publisher` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_publisher(
+    agent: FipaHandle,
+    topic: *const FipaTopic,
+    publisher: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(publisher, "the handle")?;
+        let own = table::get::<OwnAgent>(agent)?;
+        // SAFETY: The caller promises it.
+        let topic = unsafe { structure(topic, "the topic") }?;
+        // SAFETY: The caller promises it.
+        let mut described = Topic::new(unsafe { topic.name.required("the name of the topic") }?);
+        // SAFETY: The caller promises it.
+        let media_type = unsafe { topic.media_type.read("the media_type") }?;
+        if let Some(media_type) = media_type.filter(|media_type| !media_type.is_empty()) {
+            described = described.media_type(media_type);
+        }
+        if topic.rate != 0.0 {
+            if !topic.rate.is_finite() || topic.rate < 0.0 {
+                return Err(Failure::invalid(
+                    "the rate of a topic is not a positive number",
+                ));
+            }
+            described = described.rate(topic.rate);
+        }
+        described = described.latched(topic.latched);
+        let opened = async { own.agent.publisher(described) }.wait().or_fail()?;
+        // SAFETY: The caller promises it.
+        unsafe { put(publisher, table::add(OpenPublisher(opened)), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Notifies all subscribers. Waits only for a subscriber that asks for all notifications and is slow, at most 5 s.
+/// `subscribers` may be NULL, or gets their number.
+///
+/// # Safety
+/// The content must be readable. `subscribers` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_publish(
+    publisher: FipaHandle,
+    content: FipaBytes,
+    subscribers: *mut usize,
+) -> FipaResult {
+    call(|| {
+        let publisher = table::get::<OpenPublisher>(publisher)?;
+        // SAFETY: The caller promises it.
+        let content = unsafe { copied(content) }?;
+        let publication = publisher.0.publish(content).wait();
+        // SAFETY: The caller promises it.
+        unsafe { count(subscribers, publication.subscribers()) }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Loans memory of `len` bytes for a notification, which subscribers on this host read in place. The memory is valid
+/// until the loan is published or closed.
+///
+/// # Safety
+/// `loan` and `content` are NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_loan_notification(
+    publisher: FipaHandle,
+    len: usize,
+    loan: *mut FipaHandle,
+    content: *mut *mut u8,
+) -> FipaResult {
+    call(|| {
+        writable(loan, "the handle")?;
+        writable(content, "the content")?;
+        let publisher = table::get::<OpenPublisher>(publisher)?;
+        let mut loaned = publisher.0.loan(len).or_fail()?;
+        let memory = loaned.content_mut().as_mut_ptr();
+        let open = OpenTopicLoan {
+            publisher,
+            loan: Mutex::new(Some(loaned)),
+        };
+        // SAFETY: The caller promises it.
+        unsafe { put(content, memory, "the content") }?;
+        // SAFETY: The caller promises it.
+        unsafe { put(loan, table::add(open), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Notifies all subscribers with a loan, as `fipa_publish`. Its handle is closed.
+///
+/// # Safety
+/// `subscribers` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_publish_loan(
+    loan: FipaHandle,
+    subscribers: *mut usize,
+) -> FipaResult {
+    call(|| {
+        let open = table::get::<OpenTopicLoan>(loan)?;
+        let taken = open.loan.lock().take();
+        let taken =
+            taken.ok_or_else(|| Failure::new(FipaResult::BadHandle, "the loan was published"))?;
+        drop(table::remove(loan));
+        let publication = open.publisher.0.publish_loan(taken).wait();
+        // SAFETY: The caller promises it.
+        unsafe { count(subscribers, publication.subscribers()) }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+/// Writes a number if the caller asks for it.
+///
+/// # Safety
+/// `at` is NULL or can be written.
+unsafe fn count(at: *mut usize, number: usize) -> Result<(), Failure> {
+    if at.is_null() {
+        return Ok(());
+    }
+    // SAFETY: The caller promises it.
+    unsafe { put(at, number, "the number of subscribers") }
+}
+
+/// Subscribes to a topic: `message` has the publishing agent as its receiver and the name of the topic as its content.
+/// `keep` is empty, or says which notifications are wanted: `all`, or `latest N`. Each is an item of the kind
+/// `FIPA_EVENT_NOTIFICATION`. `FIPA_EVENT_INTERRUPTED` says that the publisher or its host is lost and the subscription goes on when it
+/// returns, and `FIPA_EVENT_ENDED` that the subscription has ended. Closing the operation cancels the subscription.
+///
+/// # Safety
+/// `message` is NULL or as its documentation says. The text must be readable. `operation` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_subscribe(
+    agent: FipaHandle,
+    message: *const FipaMessage,
+    keep: FipaText,
+    timeout_ms: i64,
+    tag: u64,
+    operation: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(operation, "the handle")?;
+        let own = table::get::<OwnAgent>(agent)?;
+        // SAFETY: The caller promises it.
+        let draft = unsafe { Draft::read(message) }?;
+        let act = draft.performative(Some(Performative::Subscribe))?;
+        let message = draft.with_content(own.agent.message(act))?;
+        // SAFETY: The caller promises it.
+        let keep = match unsafe { keep.read("the keep") }?.filter(|keep| !keep.is_empty()) {
+            Some(keep) => keep
+                .parse()
+                .map_err(|error| Failure::invalid(format!("{error}")))?,
+            None => Keep::Auto,
+        };
+        let timeout = limit(timeout_ms).unwrap_or(TIMEOUT);
+        let events = notifications(own.agent.clone(), message, keep, timeout);
+        let began = OperationHandle::of(own.items.follow(tag, events));
+        // SAFETY: The caller promises it.
+        unsafe { put(operation, table::add(began), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
+
+enum Reading {
+    Begin(Agent, MessageBuilder, Keep, Duration),
+    Next(Subscription),
+    Over,
+}
+
+fn notifications(
+    agent: Agent,
+    message: MessageBuilder,
+    keep: Keep,
+    timeout: Duration,
+) -> impl Stream<Item = Event> + Send {
+    unfold(
+        Reading::Begin(agent, message, keep, timeout),
+        async |state| {
+            let mut subscription = match state {
+                Reading::Begin(agent, message, keep, timeout) => {
+                    match agent.subscribe_keeping(keep, message, timeout).await {
+                        Ok(subscription) => subscription,
+                        Err(error) => return Some((failed(Failure::of(error)), Reading::Over)),
+                    }
+                }
+                Reading::Next(subscription) => subscription,
+                Reading::Over => return None,
+            };
+            let next: Result<_, DialogueError> = subscription.next().await;
+            Some(match next {
+                Ok(notification) => {
+                    let missed = notification.missed();
+                    let event = Event::Notification(Letter::from(notification), missed);
+                    (event, Reading::Next(subscription))
+                }
+                Err(error) if subscription.goes_on() => (
+                    Event::Interrupted(Failure::of(error)),
+                    Reading::Next(subscription),
+                ),
+                Err(error) => (failed(Failure::of(error)), Reading::Over),
+            })
+        },
+    )
+}

@@ -1,0 +1,379 @@
+/* Each call of the interface, between agents of one process. The configuration is the first argument. */
+
+#include <poll.h>
+
+#include "check.h"
+
+static fipa_handle domain, rover, arm;
+
+static fipa_handle open_domain(const char *config) {
+  fipa_domain_options options;
+  fipa_handle opened = 0;
+  memset(&options, 0, sizeof options);
+  options.size = sizeof options;
+  options.config = text(config);
+  OK(fipa_open(&options, &opened));
+  return opened;
+}
+
+static void close_all(const fipa_handle *handles, size_t count) {
+  for (size_t i = 0; i < count; i++) {
+    OK(fipa_close(handles[i]));
+    CHECK(fipa_close(handles[i]) == FIPA_RESULT_BAD_HANDLE);
+  }
+}
+
+static void letters(void) {
+  fipa_text to = text("arm");
+  fipa_message lift = message("inform", &to, "(lift crate)");
+  fipa_parameter parameter = {text("X-weight"), text("12")};
+  fipa_handle outcomes, letter, answer;
+  fipa_text json;
+  fipa_letter_info info;
+  fipa_message read;
+
+  lift.language = text("fipa-sl");
+  lift.ontology = text("logistics");
+  lift.conversation_id = text("c1");
+  lift.reply_by = INT64_C(1893456000000000000);
+  lift.parameters = &parameter;
+  lift.parameter_count = 1;
+  OK(fipa_send(rover, &lift, -1, &outcomes));
+  OK(fipa_read_text(outcomes, &json));
+  CHECK(has(json, "\"outcome\":\"delivered\"") && has(json, "\"receiver\":\"arm\""));
+
+  OK(fipa_receive(arm, LONG, &letter));
+  CHECK(content_is(letter, "(lift crate)"));
+  memset(&read, 0, sizeof read);
+  read.size = sizeof read;
+  OK(fipa_read_message(letter, &read));
+  CHECK(is(read.performative, "inform") && is(read.sender, "rover"));
+  CHECK(read.receiver_count == 1 && is(read.receivers[0], "arm"));
+  CHECK(is(read.language, "fipa-sl") && is(read.ontology, "logistics"));
+  CHECK(is(read.conversation_id, "c1") && read.protocol.data == NULL);
+  CHECK(read.reply_by == lift.reply_by);
+  CHECK(read.parameter_count == 1 && is(read.parameters[0].name, "X-weight"));
+  CHECK(is(read.parameters[0].value, "12"));
+  memset(&info, 0, sizeof info);
+  info.size = sizeof info;
+  OK(fipa_read_info(letter, &info));
+  CHECK(info.violation.len == 0);
+
+  lift = message("confirm", NULL, "done");
+  OK(fipa_answer(arm, letter, &lift, -1, NULL));
+  OK(fipa_receive(rover, LONG, &answer));
+  CHECK(content_is(answer, "done"));
+  memset(&read, 0, sizeof read);
+  read.size = sizeof read;
+  OK(fipa_read_message(answer, &read));
+  CHECK(is(read.conversation_id, "c1") && is(read.sender, "arm"));
+  CHECK(fipa_receive(rover, 0, &answer) == FIPA_RESULT_EMPTY);
+  CHECK(fipa_receive(rover, 1, &answer) == FIPA_RESULT_EMPTY);
+
+  to = text("nobody");
+  lift = message("inform", &to, "");
+  CHECK(fipa_send(rover, &lift, 100, NULL) == FIPA_RESULT_NOT_DELIVERED);
+  CHECK(has(fipa_error(), "no such agent"));
+  /* The report of the message transport service. */
+  OK(fipa_receive(rover, LONG, &answer));
+  CHECK(fipa_read_content(answer, NULL) == FIPA_RESULT_INVALID);
+  OK(fipa_close(answer));
+  OK(fipa_close(outcomes));
+  OK(fipa_close(letter));
+}
+
+static void loans(void) {
+  const size_t len = 1000000;
+  fipa_text to = text("arm");
+  fipa_message image = message("inform", &to, NULL);
+  fipa_handle loan, letter;
+  fipa_bytes content;
+  uint8_t *memory;
+
+  OK(fipa_loan(rover, &image, len, &loan, &memory));
+  memset(memory, 7, len);
+  OK(fipa_send_loan(loan, -1, NULL));
+  CHECK(fipa_send_loan(loan, -1, NULL) == FIPA_RESULT_BAD_HANDLE);
+  OK(fipa_receive(arm, LONG, &letter));
+  OK(fipa_read_content(letter, &content));
+  CHECK(content.len == len && content.data[0] == 7 && content.data[len - 1] == 7);
+  OK(fipa_close(letter));
+
+  OK(fipa_loan(rover, &image, 10, &loan, &memory));
+  memcpy(memory, "0123456789", 10);
+  OK(fipa_begin_send_loan(loan, -1, 5));
+  OK(fipa_close(next(domain, 5, FIPA_EVENT_OUTCOMES).handle));
+  OK(fipa_receive(arm, LONG, &letter));
+  CHECK(content_is(letter, "0123456789"));
+  OK(fipa_close(letter));
+
+  OK(fipa_loan(rover, &image, 10, &loan, &memory));
+  OK(fipa_close(loan));
+  CHECK(fipa_loan(rover, &image, SIZE_MAX, &loan, &memory) == FIPA_RESULT_TOO_LARGE);
+}
+
+/* An event loop: the descriptor is polled, and items are taken until there is none. */
+static void items(void) {
+  fipa_text to = text("arm");
+  fipa_message one = message("inform", &to, "1");
+  fipa_handle listening, again;
+  struct pollfd polled = {0, POLLIN, 0};
+  fipa_item item;
+  int letters = 0, outcomes = 0, fd = -1;
+
+  OK(fipa_fd(domain, &fd));
+  polled.fd = fd;
+  OK(fipa_listen(arm, 1, &listening));
+  CHECK(is_empty(domain));
+  CHECK(poll(&polled, 1, 0) == 0);
+  for (int i = 0; i < 100; i++) {
+    OK(fipa_begin_send(rover, &one, -1, 2));
+  }
+  while (letters < 100 || outcomes < 100) {
+    CHECK(poll(&polled, 1, LONG) == 1);
+    memset(&item, 0, sizeof item);
+    item.size = sizeof item;
+    while (fipa_next(domain, 0, &item) == FIPA_RESULT_OK) {
+      CHECK(item.result == FIPA_RESULT_OK);
+      letters += item.kind == FIPA_EVENT_LETTER && item.tag == 1;
+      outcomes += item.kind == FIPA_EVENT_OUTCOMES && item.tag == 2;
+      OK(fipa_close(item.handle));
+    }
+  }
+  CHECK(letters == 100 && outcomes == 100);
+
+  /* A letter that nobody has taken stays with its agent. */
+  OK(fipa_close(listening));
+  OK(fipa_send(rover, &one, -1, NULL));
+  CHECK(is_empty(domain));
+  OK(fipa_listen(arm, 3, &again));
+  item = next(domain, 3, FIPA_EVENT_LETTER);
+  CHECK(content_is(item.handle, "1"));
+  OK(fipa_close(item.handle));
+  OK(fipa_close(again));
+}
+
+static void directory(void) {
+  fipa_handle agents, routes, following, camera;
+  fipa_agent_options options;
+  fipa_text json;
+  fipa_item item;
+
+  OK(fipa_agents(domain, text("ro.*"), text(""), &agents));
+  OK(fipa_read_text(agents, &json));
+  CHECK(has(json, "\"name\":\"rover\"") && !has(json, "\"name\":\"arm\""));
+  OK(fipa_close(agents));
+  CHECK(fipa_agents(domain, text("(ro"), text(""), &agents) == FIPA_RESULT_INVALID);
+  OK(fipa_routes(domain, text("arm"), &routes));
+  OK(fipa_read_text(routes, &json));
+  CHECK(has(json, "\"routes\":["));
+  OK(fipa_close(routes));
+
+  OK(fipa_follow_agents(domain, 8, &following));
+  memset(&options, 0, sizeof options);
+  options.size = sizeof options;
+  options.agent_type = text("camera");
+  options.description = text("at the front");
+  OK(fipa_register(domain, text("camera_1"), &options, &camera));
+  item = next(domain, 8, FIPA_EVENT_CHANGE);
+  OK(fipa_read_text(item.handle, &json));
+  CHECK(has(json, "\"change\":\"joined\"") && has(json, "at the front"));
+  OK(fipa_close(item.handle));
+  OK(fipa_agents(domain, text(""), text("camera"), &agents));
+  OK(fipa_read_text(agents, &json));
+  CHECK(has(json, "camera_1"));
+  OK(fipa_close(agents));
+  CHECK(fipa_register(domain, text("camera_1"), NULL, &agents) == FIPA_RESULT_NAME_TAKEN);
+  CHECK(has(fipa_error(), "camera_1"));
+  OK(fipa_close(camera));
+  item = next(domain, 8, FIPA_EVENT_CHANGE);
+  OK(fipa_read_text(item.handle, &json));
+  CHECK(has(json, "\"change\":\"left\""));
+  OK(fipa_close(item.handle));
+  OK(fipa_close(following));
+}
+
+static void requests(void) {
+  fipa_text to = text("arm");
+  fipa_message lift = message("request", &to, "lift");
+  fipa_handle server, request, task;
+  fipa_item item;
+
+  OK(fipa_serve(arm, text("fipa-request"), 10, &server));
+  CHECK(fipa_serve(arm, text("no-protocol"), 11, &task) != FIPA_RESULT_OK);
+
+  /* Agreed, then the result. */
+  OK(fipa_begin_request(rover, &lift, LONG, 20, &request));
+  task = next(domain, 10, FIPA_EVENT_TASK).handle;
+  CHECK(content_is(task, "lift"));
+  OK(fipa_task_reply(task, FIPA_REPLY_AGREE, bytes("")));
+  next(domain, 20, FIPA_EVENT_AGREED);
+  OK(fipa_begin_task_reply(task, FIPA_REPLY_INFORM, bytes("lifted"), 12));
+  for (int i = 0; i < 2; i++) {
+    memset(&item, 0, sizeof item);
+    item.size = sizeof item;
+    OK(fipa_next(domain, LONG, &item));
+    CHECK(item.result == FIPA_RESULT_OK);
+    if (item.kind == FIPA_EVENT_ANSWER) {
+      CHECK(content_is(item.handle, "lifted"));
+      OK(fipa_close(item.handle));
+    } else {
+      CHECK(item.kind == FIPA_EVENT_ENDED && item.tag == 12);
+    }
+  }
+  CHECK(fipa_task_reply(task, FIPA_REPLY_INFORM, bytes("again")) == FIPA_RESULT_CLOSED);
+  OK(fipa_close(task));
+  OK(fipa_close(request));
+
+  /* Refused, with the reason. */
+  OK(fipa_begin_request(rover, &lift, LONG, 21, &request));
+  task = next(domain, 10, FIPA_EVENT_TASK).handle;
+  CHECK(fipa_task_reply(task, 99, bytes("")) == FIPA_RESULT_INVALID);
+  OK(fipa_task_reply(task, FIPA_REPLY_REFUSE, bytes("too heavy")));
+  item = next(domain, 21, FIPA_EVENT_ENDED);
+  CHECK(item.result == FIPA_RESULT_REFUSED && has(fipa_error(), "too heavy"));
+  OK(fipa_close(task));
+  OK(fipa_close(request));
+
+  /* Closed without an answer. */
+  OK(fipa_begin_request(rover, &lift, LONG, 22, &request));
+  OK(fipa_close(next(domain, 10, FIPA_EVENT_TASK).handle));
+  item = next(domain, 22, FIPA_EVENT_ENDED);
+  CHECK(item.result == FIPA_RESULT_REFUSED);
+  OK(fipa_close(request));
+
+  /* Cancelled, and the other side confirms. */
+  OK(fipa_begin_request(rover, &lift, LONG, 23, &request));
+  task = next(domain, 10, FIPA_EVENT_TASK).handle;
+  OK(fipa_task_reply(task, FIPA_REPLY_AGREE, bytes("")));
+  next(domain, 23, FIPA_EVENT_AGREED);
+  OK(fipa_cancel(request));
+  CHECK(next(domain, 10, FIPA_EVENT_CANCEL).handle == task);
+  OK(fipa_begin_task_reply(task, FIPA_REPLY_INFORM, bytes("stopped"), 13));
+  for (int i = 0; i < 2; i++) {
+    memset(&item, 0, sizeof item);
+    item.size = sizeof item;
+    OK(fipa_next(domain, LONG, &item));
+    CHECK(item.kind == FIPA_EVENT_ENDED);
+    CHECK(item.result == (item.tag == 23 ? FIPA_RESULT_CANCELLED : FIPA_RESULT_OK));
+  }
+  OK(fipa_close(task));
+  OK(fipa_close(request));
+  OK(fipa_close(server));
+
+  to = text("nobody");
+  CHECK(fipa_request(rover, &lift, 1000, &task) == FIPA_RESULT_NOT_DELIVERED);
+  OK(fipa_register(domain, text("nobody"), NULL, &server));
+  CHECK(fipa_request(rover, &lift, 10, &task) == FIPA_RESULT_TIMED_OUT);
+  OK(fipa_close(server));
+}
+
+static void topics(void) {
+  fipa_text to = text("arm");
+  fipa_message charge = message("subscribe", &to, "charge");
+  fipa_handle publisher, subscription, loan;
+  fipa_topic topic;
+  fipa_item item;
+  uint8_t *memory;
+  size_t subscribers = 0;
+
+  memset(&topic, 0, sizeof topic);
+  topic.size = sizeof topic;
+  topic.name = text("charge");
+  topic.media_type = text("text/plain");
+  topic.latched = 1;
+  OK(fipa_publisher(arm, &topic, &publisher));
+  OK(fipa_publish(publisher, bytes("90"), NULL));
+  OK(fipa_subscribe(rover, &charge, text("all"), LONG, 30, &subscription));
+  item = next(domain, 30, FIPA_EVENT_NOTIFICATION);
+  CHECK(content_is(item.handle, "90") && item.number == 0);
+  OK(fipa_close(item.handle));
+  OK(fipa_publish(publisher, bytes("89"), &subscribers));
+  CHECK(subscribers == 1);
+  item = next(domain, 30, FIPA_EVENT_NOTIFICATION);
+  CHECK(content_is(item.handle, "89"));
+  OK(fipa_close(item.handle));
+  OK(fipa_loan_notification(publisher, 3, &loan, &memory));
+  memcpy(memory, "low", 3);
+  OK(fipa_publish_loan(loan, NULL));
+  CHECK(fipa_publish_loan(loan, NULL) == FIPA_RESULT_BAD_HANDLE);
+  item = next(domain, 30, FIPA_EVENT_NOTIFICATION);
+  CHECK(content_is(item.handle, "low"));
+  OK(fipa_close(item.handle));
+  CHECK(fipa_subscribe(rover, &charge, text("some"), LONG, 31, &loan) == FIPA_RESULT_INVALID);
+  OK(fipa_close(subscription));
+  while (subscribers != 0) {
+    OK(fipa_publish(publisher, bytes("0"), &subscribers));
+  }
+  OK(fipa_close(publisher));
+}
+
+static void locks(const char *state_dir) {
+  fipa_text bay = text("bay"), to = text("arm");
+  fipa_message command = message("inform", &to, "open");
+  fipa_handle owned, lock, locking, letter;
+  fipa_own_options options;
+  fipa_lock_info info;
+  fipa_item item;
+
+  memset(&options, 0, sizeof options);
+  options.size = sizeof options;
+  options.state_dir = text(state_dir);
+  options.forget = 1;
+  OK(fipa_own(arm, bay, &options, &owned));
+  OK(fipa_lock(rover, &bay, 1, LONG, &lock));
+  memset(&info, 0, sizeof info);
+  info.size = sizeof info;
+  OK(fipa_read_lock(lock, &info));
+  CHECK(info.is_held == 1 && info.remaining_ms > 0 && info.fence.len > 0);
+
+  command.lock = lock;
+  OK(fipa_send(rover, &command, -1, NULL));
+  OK(fipa_receive(arm, LONG, &letter));
+  CHECK(content_is(letter, "open"));
+  OK(fipa_check_fence(owned, letter));
+  OK(fipa_close(lock));
+  CHECK(fipa_send(rover, &command, -1, NULL) == FIPA_RESULT_BAD_HANDLE);
+
+  /* The command of the former holder is late. */
+  OK(fipa_begin_lock(rover, &bay, 1, LONG, 40, &locking));
+  item = next(domain, 40, FIPA_EVENT_LOCK);
+  CHECK(fipa_check_fence(owned, letter) == FIPA_RESULT_STALE);
+  OK(fipa_close(letter));
+  OK(fipa_close(item.handle));
+  CHECK(next(domain, 40, FIPA_EVENT_ENDED).result == FIPA_RESULT_CLOSED);
+  OK(fipa_close(locking));
+  OK(fipa_close(owned));
+}
+
+int main(int argc, char **argv) {
+  fipa_handle listening, letter;
+  fipa_result result;
+  CHECK(argc == 3);
+  CHECK(is(fipa_version(), VERSION));
+  domain = open_domain(argv[1]);
+  OK(fipa_register(domain, text("rover"), NULL, &rover));
+  OK(fipa_register(domain, text("arm"), NULL, &arm));
+  letters();
+  loans();
+  items();
+  directory();
+  requests();
+  topics();
+  CHECK(fipa_receive(arm, 0, &listening) == FIPA_RESULT_EMPTY);
+  locks(argv[2]);
+
+  /* Closing an agent ends what waits for it, and closing the domain closes the rest. */
+  OK(fipa_listen(arm, 50, &listening));
+  OK(fipa_close(arm));
+  CHECK(next(domain, 50, FIPA_EVENT_ENDED).result == FIPA_RESULT_CLOSED);
+  close_all(&domain, 1);
+  /* Letters that were delivered before, such as the reports of ended conversations, are not lost. */
+  do {
+    result = fipa_receive(rover, 0, &letter);
+  } while (result == FIPA_RESULT_OK && fipa_close(letter) == FIPA_RESULT_OK);
+  CHECK(result == FIPA_RESULT_CLOSED);
+  OK(fipa_close(rover));
+  puts("all steps passed");
+  return 0;
+}
