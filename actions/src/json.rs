@@ -144,7 +144,7 @@ impl Language for Json {
             (Some(goal), None, None, None) if goal.action == CANCEL => return Err(FORM),
             (Some(goal), None, None, None) => Ask::Goal(Goal {
                 action: goal.action,
-                arguments: parameters(goal.arguments)?,
+                arguments: arguments_from_json(goal.arguments)?,
                 id: goal.id,
                 deadline: goal.deadline,
                 fence: goal.fence,
@@ -173,7 +173,7 @@ impl Language for Json {
                 JsonAnswer::Agreed(if queued { "queued" } else { "executing" }.to_owned())
             }
             ActionAnswer::Done(None) => JsonAnswer::Done,
-            ActionAnswer::Done(Some(value)) => JsonAnswer::Result(json(&value)?),
+            ActionAnswer::Done(Some(value)) => JsonAnswer::Result(term_to_json(&value)?),
             ActionAnswer::Refused(reason) => JsonAnswer::Refused(reason),
             ActionAnswer::Failed(reason) => JsonAnswer::Failed(reason),
             ActionAnswer::Actions(all) => JsonAnswer::Actions(all),
@@ -191,7 +191,9 @@ impl Language for Json {
                 Ok(ActionAnswer::Agreed { queued })
             }
             (JsonAnswer::Done, Ask::Goal(_)) => Ok(ActionAnswer::Done(None)),
-            (JsonAnswer::Result(value), Ask::Goal(_)) => Ok(ActionAnswer::Done(Some(term(value)?))),
+            (JsonAnswer::Result(value), Ask::Goal(_)) => {
+                Ok(ActionAnswer::Done(Some(term_from_json(value)?)))
+            }
             (JsonAnswer::Actions(all), Ask::Actions) => Ok(ActionAnswer::Actions(all)),
             (
                 JsonAnswer::Status(all),
@@ -222,10 +224,10 @@ fn write_status(status: &GoalStatus) -> Result<Value, LanguageError> {
     let mut written = serde_json::to_value(status)?;
     let progress = status.progress.as_ref();
     if let Some(value) = progress.and_then(|progress| progress.value.as_ref()) {
-        written["progress"]["value"] = json(value)?;
+        written["progress"]["value"] = term_to_json(value)?;
     }
     if let Some(result) = &status.result {
-        written["result"] = json(result)?;
+        written["result"] = term_to_json(result)?;
     }
     Ok(written)
 }
@@ -235,7 +237,7 @@ fn read_status(mut written: Value) -> Result<GoalStatus, LanguageError> {
     let mut take = |pointer| {
         let value = written.pointer_mut(pointer).map(Value::take);
         let value = value.filter(|value| !value.is_null());
-        value.map(term).transpose()
+        value.map(term_from_json).transpose()
     };
     let (value, result) = (take("/progress/value")?, take("/result")?);
     let mut status: GoalStatus = serde_json::from_value(written)?;
@@ -250,13 +252,17 @@ fn object(parameters: &[Parameter<'_>]) -> Result<Map<String, Value>, LanguageEr
     let parameters = parameters.iter();
     let pairs = parameters.map(|it| match &*it.name {
         SYMBOL | ARGUMENTS => Err(LanguageError::NoNotation("a parameter of this name")),
-        name => Ok((name.to_owned(), json(&it.value)?)),
+        name => Ok((name.to_owned(), term_to_json(&it.value)?)),
     });
     pairs.collect()
 }
 
-/// Writes a term as JSON.
-fn json(term: &Term<'_>) -> Result<Value, LanguageError> {
+/// Writes a term as JSON: a functional term as an object, with its symbol under `@` unless that is `object`, and
+/// positional arguments under `@arguments`.
+///
+/// # Errors
+/// If JSON has no notation for a part of the term, such as a byte string.
+pub fn term_to_json(term: &Term<'_>) -> Result<Value, LanguageError> {
     Ok(match term {
         Term::Boolean(truth) => Value::Bool(*truth),
         Term::String(text) => Value::String(text.to_string()),
@@ -274,15 +280,18 @@ fn json(term: &Term<'_>) -> Result<Value, LanguageError> {
                 .or_else(|| number.as_f64().map(Value::from));
             value.ok_or(LanguageError::NoNotation("a number of this size"))?
         }
-        Term::Sequence(elements) | Term::Set(elements) => {
-            Value::Array(elements.iter().map(json).collect::<Result<_, _>>()?)
-        }
+        Term::Sequence(elements) | Term::Set(elements) => Value::Array(
+            elements
+                .iter()
+                .map(term_to_json)
+                .collect::<Result<_, _>>()?,
+        ),
         Term::Functional(functional) => {
             let mut object = match &functional.arguments {
                 Arguments::Parameters(parameters) => object(parameters)?,
                 Arguments::Terms(terms) if terms.is_empty() => Map::new(),
                 Arguments::Terms(terms) => {
-                    let terms = terms.iter().map(json).collect::<Result<_, _>>()?;
+                    let terms = terms.iter().map(term_to_json).collect::<Result<_, _>>()?;
                     Map::from_iter([(ARGUMENTS.to_owned(), Value::Array(terms))])
                 }
             };
@@ -296,8 +305,12 @@ fn json(term: &Term<'_>) -> Result<Value, LanguageError> {
     })
 }
 
-/// Reads a term from JSON. Objects without a symbol get that of the described type.
-fn term(value: Value) -> Result<Term<'static>, LanguageError> {
+/// Reads a term from JSON, in the form that [`term_to_json`] writes. Objects without a symbol get that of the described
+/// type.
+///
+/// # Errors
+/// If SL has no notation for a part of the value, such as `null`.
+pub fn term_from_json(value: Value) -> Result<Term<'static>, LanguageError> {
     Ok(match value {
         Value::Bool(truth) => Term::Boolean(truth),
         Value::String(text) => Term::String(Cow::Owned(text)),
@@ -305,9 +318,12 @@ fn term(value: Value) -> Result<Term<'static>, LanguageError> {
             let number = Number::new(number.to_string());
             Term::Number(number.ok_or(LanguageError::Form("a number"))?)
         }
-        Value::Array(elements) => {
-            Term::Sequence(elements.into_iter().map(term).collect::<Result<_, _>>()?)
-        }
+        Value::Array(elements) => Term::Sequence(
+            elements
+                .into_iter()
+                .map(term_from_json)
+                .collect::<Result<_, _>>()?,
+        ),
         Value::Object(mut object) => {
             let symbol = match object.remove(SYMBOL) {
                 Some(Value::String(symbol)) => Cow::Owned(symbol),
@@ -316,11 +332,11 @@ fn term(value: Value) -> Result<Term<'static>, LanguageError> {
             };
             let arguments = match object.remove(ARGUMENTS) {
                 Some(Value::Array(terms)) if object.is_empty() => {
-                    let terms = terms.into_iter().map(term);
+                    let terms = terms.into_iter().map(term_from_json);
                     Arguments::Terms(terms.collect::<Result<_, _>>()?)
                 }
                 Some(_) => return Err(LanguageError::Form("arguments in \"@arguments\"")),
-                None => match parameters(object)? {
+                None => match arguments_from_json(object)? {
                     none if none.is_empty() => Arguments::Terms(Vec::new()),
                     parameters => Arguments::Parameters(parameters),
                 },
@@ -331,13 +347,18 @@ fn term(value: Value) -> Result<Term<'static>, LanguageError> {
     })
 }
 
-/// Reads the members of an object. A member that is null is left out.
-fn parameters(object: Map<String, Value>) -> Result<Vec<Parameter<'static>>, LanguageError> {
+/// Reads the members of an object as named arguments. A member that is null is left out.
+///
+/// # Errors
+/// As for [`term_from_json`].
+pub fn arguments_from_json(
+    object: Map<String, Value>,
+) -> Result<Vec<Parameter<'static>>, LanguageError> {
     let members = object.into_iter().filter(|(_, value)| !value.is_null());
     let members = members.map(|(name, value)| {
         Ok(Parameter {
             name: Cow::Owned(name),
-            value: term(value)?,
+            value: term_from_json(value)?,
         })
     });
     members.collect()

@@ -56,7 +56,7 @@ pub use executor::{
     ActionLimits, Cause, Check, Executor, Gate, OfferOptions, OfferRefused, Orphans, Output,
     Running,
 };
-pub use json::Json;
+pub use json::{Json, arguments_from_json, term_from_json, term_to_json};
 pub use language::{Language, LanguageError, language};
 pub use message::{
     ActionAnswer, Ask, Failure, Goal, GoalError, GoalRef, GoalState, GoalStatus, Progress,

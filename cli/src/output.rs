@@ -8,12 +8,10 @@ use std::io::{self, IsTerminal, Write};
 use std::time::Duration;
 
 use comfy_table::{Cell, ContentArrangement, Table, presets};
-use fipa::{Deliveries, Outcome};
 use fipa_acl::{escape, is_unprintable};
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
 use serde::Serialize;
-use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
 use crate::report::Failure;
@@ -241,6 +239,8 @@ pub(crate) fn visible_in_json(document: &str) -> Cow<'_, str> {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     #[test]

@@ -179,7 +179,7 @@ impl<'a> Robot<'a> {
 
     async fn cancel_those(&self, ask: &Ask) -> Result<Vec<GoalStatus>, ActionError> {
         let message = self.message(Performative::Request, ask)?;
-        let request = self.agent.request(message, GRACE + self.timeout()).await?;
+        let mut request = self.agent.request(message, GRACE + self.timeout()).await?;
         let answer = request.result().await?;
         match read(self.language, ask, &answer)? {
             ActionAnswer::Status(all) => Ok(all),
@@ -257,7 +257,7 @@ impl<'a> Robot<'a> {
 
     async fn query(&self, ask: &Ask) -> Result<ActionAnswer, ActionError> {
         let message = self.message(Performative::QueryRef, ask)?;
-        let request = self.agent.query(message, self.timeout()).await?;
+        let mut request = self.agent.query(message, self.timeout()).await?;
         let answer = request.result().await?;
         read(self.language, ask, &answer)
     }

@@ -90,8 +90,8 @@ pub(crate) mod table;
 pub use client::{ActionError, GoalHandle, ProgressUpdates, Robot, StatusUpdates};
 pub use fipa_actions::{
     ActionDescription, Cause, Failure, Field, Goal, GoalError, GoalRef, GoalState, GoalStatus,
-    ONTOLOGY, OfferRefused, Orphans, ParameterDescription, Policy, Progress, ProgressError, Range,
-    Refusal, Type,
+    LanguageError, ONTOLOGY, OfferRefused, Orphans, ParameterDescription, Policy, Progress,
+    ProgressError, Range, Refusal, Type, arguments_from_json, term_from_json, term_to_json,
 };
 pub use fipa_content::Term;
 pub use offer::{Action, Offer, OfferError};

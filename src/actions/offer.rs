@@ -46,10 +46,7 @@ pub struct Action {
 impl Action {
     /// Creates an action without parameters and result. A goal is refused while another one runs.
     pub fn new(name: impl Into<String>) -> Self {
-        Self {
-            description: ActionDescription::new(name),
-            options: OfferOptions::default(),
-        }
+        ActionDescription::new(name).into()
     }
 
     /// Sets the description in words.
@@ -128,6 +125,17 @@ impl Action {
             let fence = text.parse::<crate::locks::Fence>();
             fence.is_ok_and(|fence| admission.admit(&fence))
         })
+    }
+}
+
+/// An action of this description, with the default options.
+impl From<ActionDescription> for Action {
+    fn from(description: ActionDescription) -> Self {
+        let options = OfferOptions::default();
+        Self {
+            description,
+            options,
+        }
     }
 }
 

@@ -244,7 +244,7 @@ async fn refusals_are_typed_and_wrong_goals_reach_no_handler() {
             .ontology(fipa::actions::ONTOLOGY)
             .language(language)
             .content(content);
-        let request = rover.request(request, TIMEOUT).await.unwrap();
+        let mut request = rover.request(request, TIMEOUT).await.unwrap();
         let refused = request.result().await;
         assert!(
             matches!(refused, Err(DialogueError::Refused(_))),

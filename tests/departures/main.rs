@@ -79,7 +79,7 @@ async fn a_killed_partner_ends_every_call_that_waits_for_it() {
     let when = rover
         .protocols()
         .request_when(ask(Performative::RequestWhen), TIMEOUT);
-    let when = when.await.unwrap();
+    let mut when = when.await.unwrap();
     let charge = rover.subscribe(ask(Performative::Subscribe), TIMEOUT).await;
     let mut charge = charge.unwrap();
     assert_eq!(text(&patient(charge.next()).await.unwrap()), "first");
@@ -240,7 +240,7 @@ async fn an_answer_that_precedes_the_end_of_its_sender_counts() {
     for _ in 0..20 {
         let arm = there.register("arm").await.unwrap();
         let request = to(&rover, Performative::Request, "arm");
-        let request = rover.request(request, TIMEOUT).await.unwrap();
+        let mut request = rover.request(request, TIMEOUT).await.unwrap();
         let first = patient(arm.receive()).await.unwrap().into_message();
         let done = arm.reply(&first, Performative::Inform).content("done");
         arm.send(done.build().unwrap()).await.unwrap();
@@ -332,14 +332,14 @@ async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
     let mut reachability = request.reachability();
     assert!(reachability.unreachable().is_empty());
     let short = to(&rover, Performative::Request, "arm");
-    let short = rover.request(short, Duration::from_secs(5)).await.unwrap();
+    let mut short = rover.request(short, Duration::from_secs(5)).await.unwrap();
     let charge = to(&rover, Performative::Subscribe, "arm");
     let mut charge = rover.subscribe(charge, TIMEOUT).await.unwrap();
     assert_eq!(text(&patient(charge.next()).await.unwrap()), "first");
 
     hosts.far.signal(Signal::STOP);
-    let result = tokio::spawn(request.result());
-    let impatient = tokio::spawn(short.result());
+    let result = tokio::spawn(async move { request.result().await });
+    let impatient = tokio::spawn(async move { short.result().await });
     assert!(patient(reachability.changed()).await);
     let silent = reachability.unreachable();
     assert_eq!(silent[0].agent, "arm");

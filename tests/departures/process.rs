@@ -87,7 +87,7 @@ async fn start(agent: Arc<Agent>) {
     let request = agent
         .message(Performative::Request)
         .receiver(AgentId::new("rover").unwrap());
-    let request = agent.request(request, FOREVER).await.unwrap();
+    let mut request = agent.request(request, FOREVER).await.unwrap();
     let _ = request.result().await;
 }
 

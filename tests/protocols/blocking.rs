@@ -66,7 +66,7 @@ fn a_handler_that_blocks_does_not_delay_the_others() {
         let lift = lift.receiver(arm.id().clone());
         rover.request(lift, TIMEOUT).wait().unwrap()
     });
-    for request in requests {
+    for mut request in requests {
         assert_eq!(text(&request.result().wait().unwrap()), "done");
     }
 }

@@ -172,7 +172,7 @@ async fn each_kind_of_answer_yields_its_result_or_error() {
 async fn missing_and_invalid_answers_are_errors() {
     let (rover, arm) = pair(&[]).await;
     let lift = || to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift(), Duration::from_secs(1)).await.unwrap();
+    let mut request = rover.request(lift(), Duration::from_secs(1)).await.unwrap();
     assert!(matches!(
         request.result().await,
         Err(DialogueError::TimedOut)
@@ -185,7 +185,7 @@ async fn missing_and_invalid_answers_are_errors() {
     assert_eq!(*late.performative(), Performative::Agree);
 
     // No right answer follows the invalid one.
-    let request = rover.request(lift(), Duration::from_secs(1)).await.unwrap();
+    let mut request = rover.request(lift(), Duration::from_secs(1)).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     let invalid = arm.reply(&first, Performative::Propose).build().unwrap();
     arm.send(invalid).await.unwrap();
@@ -196,7 +196,7 @@ async fn missing_and_invalid_answers_are_errors() {
         }
         other => panic!("{other:?}"),
     }
-    let request = rover.request(lift(), TIMEOUT).await.unwrap();
+    let mut request = rover.request(lift(), TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     let answer = arm
         .reply(&first, Performative::NotUnderstood)
@@ -216,7 +216,7 @@ async fn missing_and_invalid_answers_are_errors() {
 async fn other_messages_are_received_during_a_conversation() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift, TIMEOUT).await.unwrap();
+    let mut request = rover.request(lift, TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap();
     for number in 0..5 {
         let note = to(&arm, Performative::Inform, &rover, &number.to_string());

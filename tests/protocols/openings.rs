@@ -217,7 +217,7 @@ async fn a_request_needs_receivers_that_stand_for_one_agent() {
     }
     for one in ["led", ".*_2"] {
         let lift = rover.message(Performative::Request).receivers(ids(&[one]));
-        let request = rover.request(lift, TIMEOUT).await.unwrap();
+        let mut request = rover.request(lift, TIMEOUT).await.unwrap();
         let first = next_message(&arms[1]).await.unwrap();
         respond(&arms[1], &first, async |_| Ok(Reply::Inform("done".into())))
             .await
@@ -267,11 +267,11 @@ async fn a_dropped_task_tells_its_initiator() {
         let first = next_message(&arm).await.unwrap();
         (request, arm.take_part(&first).unwrap())
     };
-    let (request, task) = ask(Performative::Request).await;
+    let (mut request, task) = ask(Performative::Request).await;
     drop(task);
     let result = request.result().await;
     assert!(matches!(result, Err(DialogueError::NotUnderstood(_))));
-    let (request, mut task) = ask(Performative::Request).await;
+    let (mut request, mut task) = ask(Performative::Request).await;
     task.agree("").await.unwrap();
     drop(task);
     assert!(matches!(
@@ -279,7 +279,7 @@ async fn a_dropped_task_tells_its_initiator() {
         Err(DialogueError::Failed(_))
     ));
     // A task that is over, or was ended without a message, sends nothing.
-    let (request, task) = ask(Performative::Request).await;
+    let (mut request, task) = ask(Performative::Request).await;
     task.reply(Reply::Inform("done".into())).await.unwrap();
     request.result().await.unwrap();
     let (_request, task) = ask(Performative::Request).await;
@@ -456,7 +456,7 @@ async fn a_message_of_an_outsider_never_reaches_a_conversation() {
     let (rover, arm) = pair(&[]).await;
     let mallory = arm.domain().register("mallory").await.unwrap();
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift, TIMEOUT).await.unwrap();
+    let mut request = rover.request(lift, TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap();
     let id = request.conversation_id().to_owned();
     for act in [Performative::Inform, Performative::Failure] {
@@ -482,7 +482,7 @@ async fn a_message_of_an_outsider_never_reaches_a_conversation() {
     assert_eq!(text(&result.unwrap()), "done");
     // A conversation that mallory begins with the same id exists beside it.
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift, TIMEOUT).await.unwrap();
+    let mut request = rover.request(lift, TIMEOUT).await.unwrap();
     let opening = to(&mallory, Performative::Request, &rover, "open")
         .protocol("fipa-request")
         .conversation_id(request.conversation_id());

@@ -37,7 +37,7 @@ async fn the_first_answer_that_ends_a_request_stays() {
 async fn superfluous_messages_do_not_end_a_request() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift, TIMEOUT).await.unwrap();
+    let mut request = rover.request(lift, TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     for act in [
         Performative::Agree,

@@ -74,7 +74,7 @@ async fn four_verdicts_for_a_request_and_its_inform() {
     // Calls that lead a conversation check its messages themselves, with any `monitor.check`. The
     // checks of `monitor.check` stay at one per side and message.
     let lift = to(&rover, Performative::Request, &arm, "lift");
-    let request = rover.request(lift, TIMEOUT).await.unwrap();
+    let mut request = rover.request(lift, TIMEOUT).await.unwrap();
     let id = request.conversation_id().to_owned();
     let asked = next_message(&arm).await.unwrap();
     let task = arm.take_part(&asked).unwrap();

@@ -154,6 +154,40 @@ enum fipa_event
    handle.
    */
   FIPA_EVENT_INTERRUPTED = 10,
+  /*
+   The answers to a call for proposals: `fipa_read_bid`, `fipa_award`. `number` is the number of proposals.
+   */
+  FIPA_EVENT_BIDS = 11,
+  /*
+   The result of an accepted proposal: `fipa_read_message`, or no handle and the failure in `result`. `number` is
+   the index of the proposal.
+   */
+  FIPA_EVENT_AWARDED = 12,
+  /*
+   The initiator has decided on the proposal of a task, whose handle it is. `number` is 1 if it has accepted.
+   */
+  FIPA_EVENT_DECISION = 13,
+  /*
+   A goal of an action that this agent offers: `fipa_read_text` returns its arguments, `fipa_goal_end` ends it.
+   */
+  FIPA_EVENT_GOAL = 14,
+  /*
+   A goal is to stop, for the reason in `result`: it was cancelled (`FIPA_RESULT_CANCELLED`), its time is over, or
+   its client is gone. The handle is that of the goal.
+   */
+  FIPA_EVENT_STOP = 15,
+  /*
+   A robot has accepted a goal. There is no handle.
+   */
+  FIPA_EVENT_ACCEPTED = 16,
+  /*
+   The progress of a goal: `fipa_read_text`, a JSON object with `state`, `fraction`, `note` and `value`.
+   */
+  FIPA_EVENT_PROGRESS = 17,
+  /*
+   The result of a goal or of a question: `fipa_read_text`, the value in JSON.
+   */
+  FIPA_EVENT_RESULT = 18,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -191,6 +225,11 @@ enum fipa_reply
    An `inform` after which the conversation goes on, such as a notification of a subscription.
    */
   FIPA_REPLY_NOTIFY = 4,
+  /*
+   A proposal, as an answer to a call (FIPA00029). The decision is an item of the kind `FIPA_EVENT_DECISION`. The
+   result of an accepted proposal is the last message; after a rejection there is none.
+   */
+  FIPA_REPLY_PROPOSE = 5,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -517,6 +556,71 @@ struct fipa_text fipa_version(void);
 struct fipa_text fipa_error(void);
 
 /*
+ Offers an action. `description` is a JSON object with a `name` and, as far as they are needed, `description`,
+ `parameters` (each with `name`, `type` such as `number`, and `unit`, `range`, `default`, `description`,
+ `optional`), `result` (a type), and `policy` (`reject`, `preempt`, or `{"queue": N}`). Each goal is an item of the
+ kind `FIPA_EVENT_GOAL`. Closing the offer withdraws the action and cancels its goals.
+
+ # Safety
+ The text must be readable. `offer` is NULL or can be written.
+ */
+fipa_result fipa_offer(fipa_handle agent,
+                       struct fipa_text description,
+                       uint64_t tag,
+                       fipa_handle *offer);
+
+/*
+ Reports the progress of a goal: a JSON object with `fraction` from 0 to 1, `note` and `value`, each optional.
+
+ # Safety
+ The text must be readable.
+ */
+fipa_result fipa_goal_progress(fipa_handle goal,
+                               struct fipa_text progress);
+
+/*
+ Ends a goal: with its result, a value in JSON or an empty text, if `is_done` is not 0; else with a failure, whose
+ reason is the text. The caller closes the handle afterwards. A goal that is closed without an end fails.
+
+ # Safety
+ The text must be readable.
+ */
+fipa_result fipa_goal_end(fipa_handle goal,
+                          int32_t is_done,
+                          struct fipa_text result);
+
+/*
+ Lists the actions of a robot. The item is of the kind `FIPA_EVENT_RESULT`, a JSON array of descriptions as in
+ `fipa_offer`, or `FIPA_EVENT_ENDED` with the failure.
+
+ # Safety
+ The text must be readable. `operation` is NULL or can be written.
+ */
+fipa_result fipa_begin_actions(fipa_handle agent,
+                               struct fipa_text robot,
+                               uint64_t tag,
+                               fipa_handle *operation);
+
+/*
+ Invokes an action of a robot. `arguments` is empty or a JSON object. `lock` is 0 or a lock whose first fence the
+ goal carries. With `timeout_ms`, the robot stops the goal after that time.
+
+ The items are `FIPA_EVENT_ACCEPTED`, `FIPA_EVENT_PROGRESS` as often as the robot reports it, and then
+ `FIPA_EVENT_RESULT`, or `FIPA_EVENT_ENDED` with the failure. `fipa_cancel` cancels the goal.
+
+ # Safety
+ The texts must be readable. `operation` is NULL or can be written.
+ */
+fipa_result fipa_begin_goal(fipa_handle agent,
+                            struct fipa_text robot,
+                            struct fipa_text action,
+                            struct fipa_text arguments,
+                            fipa_handle lock,
+                            int64_t timeout_ms,
+                            uint64_t tag,
+                            fipa_handle *operation);
+
+/*
  Registers an agent. `options` may be NULL. `fipa_close` deregisters it, and what it has not received is dropped.
 
  # Safety
@@ -619,6 +723,46 @@ fipa_result fipa_listen(fipa_handle agent,
                         fipa_handle *operation);
 
 /*
+ Calls the receivers of the message, names and patterns, for proposals. Waits for their answers up to `timeout_ms`
+ (10 s if it is negative). The item is of the kind `FIPA_EVENT_BIDS`, or `FIPA_EVENT_ENDED` with the failure.
+
+ # Safety
+ `message` is NULL or as its documentation says. `operation` is NULL or can be written.
+ */
+fipa_result fipa_begin_call(fipa_handle agent,
+                            const struct fipa_message *message,
+                            int64_t timeout_ms,
+                            uint64_t tag,
+                            fipa_handle *operation);
+
+/*
+ Returns a proposal, with an index from 0, as a letter that the caller closes. `fipa_read_text` of the call returns
+ the other answers in JSON: `refusals`, `silent`, `unreached`, `gone` and `violations`.
+
+ # Safety
+ `letter` is NULL or can be written.
+ */
+fipa_result fipa_read_bid(fipa_handle bids,
+                          size_t index,
+                          fipa_handle *letter);
+
+/*
+ Accepts the proposals of these indices, none or several, and rejects the others; each gets the content. Waits for
+ the results up to `timeout_ms`, or without a limit if it is negative. There is an item of the kind
+ `FIPA_EVENT_AWARDED` per accepted proposal, and then `FIPA_EVENT_ENDED`. A call is awarded once; one that is closed
+ without an award rejects all proposals.
+
+ # Safety
+ The indices and the content must be readable.
+ */
+fipa_result fipa_award(fipa_handle bids,
+                       const size_t *accepted,
+                       size_t accepted_count,
+                       struct fipa_bytes content,
+                       int64_t timeout_ms,
+                       uint64_t tag);
+
+/*
  Requests an action from one agent (FIPA00026), or asks it (FIPA00027) if the performative is `query-ref` or
  `query-if`. Waits for the result, up to `timeout_ms` or without a limit if it is negative. The caller closes the
  answer.
@@ -659,7 +803,7 @@ fipa_result fipa_serve(fipa_handle agent,
 
 /*
  Sends a message of a conversation that this agent serves, with one of the acts of `fipa_reply`, and waits until it
- is delivered. After `FIPA_EVENT_CANCEL`, `FIPA_REPLY_INFORM` confirms the cancel.
+ is delivered; a proposal, until it is decided on. After `FIPA_EVENT_CANCEL`, `FIPA_REPLY_INFORM` confirms the cancel.
 
  # Safety
  The content must be readable.
@@ -725,12 +869,14 @@ fipa_result fipa_follow_agents(fipa_handle domain,
                                fipa_handle *operation);
 
 /*
- Returns the text of a handle, until it is closed.
+ Returns the text of a handle: of a JSON text, of the answers to a call for proposals, or of the arguments of a goal.
+ It is valid until the handle is closed.
 
  # Safety
  `text` is NULL or can be written.
  */
-fipa_result fipa_read_text(fipa_handle handle, struct fipa_text *text);
+fipa_result fipa_read_text(fipa_handle handle,
+                           struct fipa_text *text);
 
 /*
  Closes a handle of any kind. What was read from it is no longer valid.

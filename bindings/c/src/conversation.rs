@@ -1,25 +1,24 @@
 //! Conversations: requests, and serving them.
 
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use fipa::blocking::Wait;
 use fipa::protocol::{DialogueError, Reply, Request, Server, Task};
 use fipa::{Agent, MessageBuilder, Performative};
-use futures_core::Stream;
 use futures_util::stream::unfold;
 use tokio::sync::{Notify, mpsc, oneshot};
 
 use crate::agent::OwnAgent;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, Items, OperationHandle, failed};
+use crate::item::{Event, GivenHandle, Items, OperationHandle, script};
 use crate::message::{Draft, FipaMessage, Letter};
 use crate::raw::{FipaBytes, FipaText, limit, put, writable};
 use crate::table::{self, FipaHandle};
 
 /// Time limit of a conversation for which the caller sets none: a year.
-const LONG: Duration = Duration::from_secs(365 * 24 * 60 * 60);
+pub(crate) const LONG: Duration = Duration::from_secs(365 * 24 * 60 * 60);
 
 /// Time for the answer to a cancel.
 const CANCEL: Duration = Duration::from_secs(10);
@@ -102,60 +101,34 @@ pub unsafe extern "C" fn fipa_begin_request(
         let (message, is_query) = unsafe { opening(&own, message) }?;
         let timeout = limit(timeout_ms).unwrap_or(LONG);
         let cancel = Arc::new(Notify::new());
-        let agent = own.agent.clone();
-        let begun = async move { begin(&agent, message, is_query, timeout).await };
-        let events = asking(begun, Arc::clone(&cancel));
+        let (agent, cancelling) = (own.agent.clone(), Arc::clone(&cancel));
+        let events = script(async move |emitter| {
+            let mut request = begin(&agent, message, is_query, timeout).await.or_fail()?;
+            loop {
+                tokio::select! {
+                    agreed = request.agreed() => {
+                        if agreed.or_fail()? {
+                            emitter.emit(Event::Agreed).await;
+                        }
+                        break;
+                    }
+                    () = cancelling.notified() => cancelled(&mut request).await.or_fail()?,
+                }
+            }
+            let answer = loop {
+                tokio::select! {
+                    answer = request.result() => break answer.or_fail()?,
+                    () = cancelling.notified() => cancelled(&mut request).await.or_fail()?,
+                }
+            };
+            emitter.emit(Event::Answer(answer.into())).await;
+            Ok(())
+        });
         let began = OperationHandle::cancellable(own.items.follow(tag, events), cancel);
         // SAFETY: The caller promises it.
         unsafe { put(operation, table::add(began), "the handle") }?;
         Ok(FipaResult::Ok)
     })
-}
-
-/// The state of a request that was begun.
-enum Asking<F> {
-    Begin(F),
-    Agreed(Request),
-    Result(Request),
-    Over,
-}
-
-fn asking<F>(begun: F, cancel: Arc<Notify>) -> impl Stream<Item = Event> + Send
-where
-    F: Future<Output = Result<Request, DialogueError>> + Send,
-{
-    unfold(
-        (Asking::Begin(begun), cancel),
-        async |(mut state, cancel)| {
-            loop {
-                let step = match state {
-                    Asking::Begin(begun) => {
-                        begun.await.map(|request| (None, Asking::Agreed(request)))
-                    }
-                    Asking::Agreed(mut request) => tokio::select! {
-                        agreed = request.agreed() => agreed.map(|agreed| {
-                            (agreed.then_some(Event::Agreed), Asking::Result(request))
-                        }),
-                        () = cancel.notified() => cancelled(&mut request).await.map(|()| (None, Asking::Result(request))),
-                    },
-                    Asking::Result(mut request) => tokio::select! {
-                        result = request.result() => {
-                            result.map(|message| (Some(Event::Answer(message.into())), Asking::Over))
-                        }
-                        () = cancel.notified() => cancelled(&mut request).await.map(|()| (None, Asking::Result(request))),
-                    },
-                    Asking::Over => return None,
-                };
-                state = match step {
-                    Ok((Some(event), next)) => return Some((event, (next, cancel))),
-                    Ok((None, next)) => next,
-                    Err(error) => {
-                        return Some((failed(Failure::of(error)), (Asking::Over, cancel)));
-                    }
-                };
-            }
-        },
-    )
 }
 
 /// Cancels a request. It ends with an error, or goes on.
@@ -167,13 +140,10 @@ async fn cancelled(request: &mut Request) -> Result<(), DialogueError> {
 /// value is dropped.
 pub(crate) struct OpenTask {
     pub(crate) first: Letter,
-    pub(crate) handle: TaskHandle,
+    pub(crate) handle: GivenHandle,
     commands: mpsc::Sender<(Command, Done)>,
     items: Items,
 }
-
-/// The handle of a task, once the caller has it.
-pub(crate) type TaskHandle = Arc<OnceLock<FipaHandle>>;
 
 type Done = oneshot::Sender<Result<(), Failure>>;
 
@@ -181,6 +151,7 @@ type Done = oneshot::Sender<Result<(), Failure>>;
 enum Command {
     Agree(Bytes),
     Notify(Bytes),
+    Propose(Bytes),
     Last(Reply),
 }
 
@@ -243,7 +214,7 @@ async fn handle(
     items: Items,
 ) -> Result<Reply, &'static str> {
     let (commands, mut commanded) = mpsc::channel::<(Command, Done)>(1);
-    let handle = TaskHandle::default();
+    let handle = GivenHandle::default();
     let open = OpenTask {
         first: Letter::from(task.message().clone()),
         handle: Arc::clone(&handle),
@@ -271,6 +242,17 @@ async fn handle(
         let result = match command {
             Command::Agree(content) => task.agree(content).await,
             Command::Notify(content) => task.inform(content).await,
+            Command::Propose(content) => match task.propose(content, LONG).await {
+                Ok(accepted) => {
+                    let _ = events.send(Event::Decision(Arc::clone(&handle), accepted));
+                    if !accepted {
+                        let _ = done.send(Ok(()));
+                        return Ok(Reply::Nothing);
+                    }
+                    Ok(())
+                }
+                Err(error) => Err(error),
+            },
             Command::Last(reply) => {
                 let result = task.reply(reply).await;
                 // The caller may no longer wait.
@@ -296,21 +278,26 @@ pub enum FipaReply {
     Failure = 3,
     /// An `inform` after which the conversation goes on, such as a notification of a subscription.
     Notify = 4,
+    /// A proposal, as an answer to a call (FIPA00029). The decision is an item of the kind `FIPA_EVENT_DECISION`. The
+    /// result of an accepted proposal is the last message; after a rejection there is none.
+    Propose = 5,
 }
 
 impl Command {
     /// Reads the number of an act. It comes from the caller, and may be any.
     fn of(act: i32, content: Bytes) -> Result<Self, Failure> {
-        const ACTS: [FipaReply; 5] = [
+        const ACTS: [FipaReply; 6] = [
             FipaReply::Agree,
             FipaReply::Inform,
             FipaReply::Refuse,
             FipaReply::Failure,
             FipaReply::Notify,
+            FipaReply::Propose,
         ];
         let known = ACTS.into_iter().find(|known| *known as i32 == act);
         Ok(match known {
             Some(FipaReply::Agree) => Self::Agree(content),
+            Some(FipaReply::Propose) => Self::Propose(content),
             Some(FipaReply::Notify) => Self::Notify(content),
             Some(FipaReply::Inform) => Self::Last(Reply::Inform(content)),
             Some(FipaReply::Refuse) => Self::Last(Reply::Refuse(content)),
@@ -341,7 +328,7 @@ impl OpenTask {
 }
 
 /// Sends a message of a conversation that this agent serves, with one of the acts of `fipa_reply`, and waits until it
-/// is delivered. After `FIPA_EVENT_CANCEL`, `FIPA_REPLY_INFORM` confirms the cancel.
+/// is delivered; a proposal, until it is decided on. After `FIPA_EVENT_CANCEL`, `FIPA_REPLY_INFORM` confirms the cancel.
 ///
 /// # Safety
 /// The content must be readable.

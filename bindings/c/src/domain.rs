@@ -10,7 +10,9 @@ use futures_util::StreamExt as _;
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use crate::actions::{OpenGoal, OpenOffer};
 use crate::agent::OwnAgent;
+use crate::contract_net::OpenCall;
 use crate::conversation::OpenServer;
 use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::item::{Event, Items, OperationHandle, failed};
@@ -198,14 +200,20 @@ fn flatten(change: &Change, all: &mut Vec<Value>) {
     }
 }
 
-/// Returns the text of a handle, until it is closed.
+/// Returns the text of a handle: of a JSON text, of the answers to a call for proposals, or of the arguments of a goal.
+/// It is valid until the handle is closed.
 ///
 /// # Safety
 /// `text` is NULL or can be written.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn fipa_read_text(handle: FipaHandle, text: *mut FipaText) -> FipaResult {
     call(|| {
-        let own = table::get::<Text>(handle)?;
+        let object = table::any(handle)?;
+        let own = object
+            .downcast_ref::<Text>()
+            .or_else(|| object.downcast_ref().map(OpenCall::answers))
+            .or_else(|| object.downcast_ref().map(OpenGoal::arguments));
+        let own = own.ok_or_else(|| table::other_kind(handle, "Text"))?;
         // SAFETY: The caller promises it.
         unsafe { put(text, FipaText::of(&own.0), "the text") }?;
         Ok(FipaResult::Ok)
@@ -224,6 +232,8 @@ pub extern "C" fn fipa_close(handle: FipaHandle) -> FipaResult {
             membership.domain.clone().close().wait();
         } else if let Some(operation) = object.downcast_ref::<OperationHandle>() {
             operation.end();
+        } else if let Some(offer) = object.downcast_ref::<OpenOffer>() {
+            offer.end();
         } else if let Some(server) = object.downcast_ref::<OpenServer>() {
             server.end();
         } else if let Some(own) = object.downcast_ref::<OwnAgent>() {

@@ -1,13 +1,18 @@
 //! The queue of a domain.
 
+use std::any::Any;
 use std::os::fd::AsRawFd as _;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use fipa::Deliveries;
 use fipa_queue::{Operation, Queue};
-use tokio::sync::Notify;
+use futures_core::Stream;
+use futures_util::stream::poll_fn;
+use tokio::sync::{Notify, mpsc};
 
-use crate::conversation::{OpenTask, TaskHandle};
+use crate::actions::OpenGoal;
+use crate::contract_net::OpenCall;
+use crate::conversation::OpenTask;
 use crate::domain::{Membership, Text};
 use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::locks::HeldLock;
@@ -45,6 +50,24 @@ pub enum FipaEvent {
     /// A subscription is interrupted for the reason in `result`, and goes on when the publisher returns. There is no
     /// handle.
     Interrupted = 10,
+    /// The answers to a call for proposals: `fipa_read_bid`, `fipa_award`. `number` is the number of proposals.
+    Bids = 11,
+    /// The result of an accepted proposal: `fipa_read_message`, or no handle and the failure in `result`. `number` is
+    /// the index of the proposal.
+    Awarded = 12,
+    /// The initiator has decided on the proposal of a task, whose handle it is. `number` is 1 if it has accepted.
+    Decision = 13,
+    /// A goal of an action that this agent offers: `fipa_read_text` returns its arguments, `fipa_goal_end` ends it.
+    Goal = 14,
+    /// A goal is to stop, for the reason in `result`: it was cancelled (`FIPA_RESULT_CANCELLED`), its time is over, or
+    /// its client is gone. The handle is that of the goal.
+    Stop = 15,
+    /// A robot has accepted a goal. There is no handle.
+    Accepted = 16,
+    /// The progress of a goal: `fipa_read_text`, a JSON object with `state`, `fraction`, `note` and `value`.
+    Progress = 17,
+    /// The result of a goal or of a question: `fipa_read_text`, the value in JSON.
+    Result = 18,
 }
 
 /// An item of a queue.
@@ -80,8 +103,19 @@ pub(crate) enum Event {
     Notification(Letter, u64),
     Interrupted(Failure),
     Lock(HeldLock),
-    Cancel(TaskHandle, Result<(), Failure>),
+    Cancel(GivenHandle, Result<(), Failure>),
+    Bids(OpenCall),
+    Awarded(usize, Result<Letter, Failure>),
+    Decision(GivenHandle, bool),
+    Goal(OpenGoal),
+    Stop(GivenHandle, Failure),
+    Accepted,
+    Progress(Text),
+    Result(Text),
 }
+
+/// The handle of a task or goal, once the caller has it.
+pub(crate) type GivenHandle = Arc<OnceLock<FipaHandle>>;
 
 pub(crate) fn failed(failure: Failure) -> Event {
     Event::Ended(Err(failure))
@@ -111,11 +145,8 @@ impl Event {
             Self::Agreed => item(FipaEvent::Agreed, 0),
             Self::Answer(letter) => item(FipaEvent::Answer, table::add(letter)),
             Self::Task(task) => {
-                let known = Arc::clone(&task.handle);
-                let handle = table::add(task);
-                // A task is an item once.
-                let _ = known.set(handle);
-                item(FipaEvent::Task, handle)
+                let given = Arc::clone(&task.handle);
+                item(FipaEvent::Task, give(task, &given))
             }
             Self::Notification(letter, missed) => FipaItem {
                 number: missed,
@@ -129,10 +160,53 @@ impl Event {
             // The item of the task has come before.
             Self::Cancel(task, cause) => FipaItem {
                 result: result(cause),
-                ..item(FipaEvent::Cancel, task.get().copied().unwrap_or(0))
+                ..item(FipaEvent::Cancel, given(&task))
             },
+            Self::Bids(call) => FipaItem {
+                number: call.proposals() as u64,
+                ..item(FipaEvent::Bids, table::add(call))
+            },
+            Self::Awarded(index, result) => {
+                let (handle, result) = match result {
+                    Ok(letter) => (table::add(letter), FipaResult::Ok),
+                    Err(failure) => (0, failure.store()),
+                };
+                FipaItem {
+                    result,
+                    number: index as u64,
+                    ..item(FipaEvent::Awarded, handle)
+                }
+            }
+            Self::Decision(task, accepted) => FipaItem {
+                number: accepted.into(),
+                ..item(FipaEvent::Decision, given(&task))
+            },
+            Self::Goal(goal) => {
+                let given = Arc::clone(&goal.handle);
+                item(FipaEvent::Goal, give(goal, &given))
+            }
+            Self::Stop(goal, cause) => FipaItem {
+                result: cause.store(),
+                ..item(FipaEvent::Stop, given(&goal))
+            },
+            Self::Accepted => item(FipaEvent::Accepted, 0),
+            Self::Progress(progress) => item(FipaEvent::Progress, table::add(progress)),
+            Self::Result(result) => item(FipaEvent::Result, table::add(result)),
         })
     }
+}
+
+/// Gives an object a handle that its later events can name.
+fn give<T: Any + Send + Sync>(object: T, given: &GivenHandle) -> FipaHandle {
+    let handle = table::add(object);
+    // An object is an item once.
+    let _ = given.set(handle);
+    handle
+}
+
+/// Returns the handle of an object whose item has come before.
+fn given(handle: &GivenHandle) -> FipaHandle {
+    handle.get().copied().unwrap_or(0)
 }
 
 fn result(result: Result<(), Failure>) -> FipaResult {
@@ -148,6 +222,41 @@ pub(crate) fn outcome(outcomes: &Deliveries) -> FipaResult {
         true => FipaResult::Ok,
         false => Failure::new(FipaResult::NotDelivered, outcomes.to_string()).store(),
     }
+}
+
+/// Sends the events of an operation. At most two wait, so an operation does not run ahead of its program.
+#[derive(Clone)]
+pub(crate) struct Emitter(mpsc::Sender<Event>);
+
+impl Emitter {
+    pub(crate) async fn emit(&self, event: Event) {
+        // Fails only if the operation was abandoned, which drops this future, too.
+        let _ = self.0.send(event).await;
+    }
+}
+
+/// The events that a function emits. An error is the last one.
+pub(crate) fn script<F>(run: impl FnOnce(Emitter) -> F) -> impl Stream<Item = Event> + Send
+where
+    F: Future<Output = Result<(), Failure>> + Send + 'static,
+{
+    let (sender, mut events) = mpsc::channel(1);
+    let emitter = Emitter(sender);
+    let running = run(emitter.clone());
+    let mut running = Some(Box::pin(async move {
+        if let Err(failure) = running.await {
+            emitter.emit(failed(failure)).await;
+        }
+    }));
+    poll_fn(move |context| {
+        if let Some(script) = &mut running
+            && script.as_mut().poll(context).is_ready()
+        {
+            // Its emitter, too, so that the stream ends after the last event.
+            running = None;
+        }
+        events.poll_recv(context)
+    })
 }
 
 /// An operation that was begun.

@@ -1,6 +1,8 @@
 #![doc = include_str!("../README.md")]
 
+mod actions;
 mod agent;
+mod contract_net;
 mod conversation;
 mod domain;
 mod failure;
@@ -12,7 +14,9 @@ mod raw;
 mod table;
 mod topics;
 
+pub use crate::actions::*;
 pub use crate::agent::*;
+pub use crate::contract_net::*;
 pub use crate::conversation::*;
 pub use crate::domain::*;
 pub use crate::failure::FipaResult;

@@ -6,12 +6,10 @@ use std::time::Duration;
 use fipa::Agent;
 use fipa::blocking::Wait;
 use fipa::locks::{Lock, LockError, OwnOptions, Owned};
-use futures_core::Stream;
-use futures_util::stream::unfold;
 
 use crate::agent::OwnAgent;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, OperationHandle, failed};
+use crate::item::{Event, OperationHandle, script};
 use crate::message::LetterRef;
 use crate::raw::{Extensible, FipaText, Readable, fill, limit, put, structure, texts, writable};
 use crate::table::{self, FipaHandle};
@@ -99,43 +97,20 @@ pub unsafe extern "C" fn fipa_begin_lock(
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let resources = unsafe { named(resources, resource_count) }?;
-        let resources = resources.into_iter().map(str::to_owned).collect();
-        let events = locking(own.agent.clone(), resources, limit(timeout_ms));
+        let resources: Vec<String> = resources.into_iter().map(str::to_owned).collect();
+        let (agent, within) = (own.agent.clone(), limit(timeout_ms));
+        let events = script(async move |emitter| {
+            let resources: Vec<&str> = resources.iter().map(String::as_str).collect();
+            let lock = acquire(&agent, &resources, within).await.or_fail()?;
+            let lost = lock.lost();
+            emitter.emit(Event::Lock(HeldLock::new(lock))).await;
+            Err(Failure::of(lost.await))
+        });
         let began = OperationHandle::of(own.items.follow(tag, events));
         // SAFETY: The caller promises it.
         unsafe { put(operation, table::add(began), "the handle") }?;
         Ok(FipaResult::Ok)
     })
-}
-
-enum Locking<F> {
-    Begin(Agent, Vec<String>, Option<Duration>),
-    Held(F),
-    Over,
-}
-
-fn locking(
-    agent: Agent,
-    resources: Vec<String>,
-    within: Option<Duration>,
-) -> impl Stream<Item = Event> + Send {
-    unfold(
-        Locking::Begin(agent, resources, within),
-        async |state| match state {
-            Locking::Begin(agent, resources, within) => {
-                let resources: Vec<&str> = resources.iter().map(String::as_str).collect();
-                Some(match acquire(&agent, &resources, within).await {
-                    Ok(lock) => {
-                        let lost = lock.lost();
-                        (Event::Lock(HeldLock::new(lock)), Locking::Held(lost))
-                    }
-                    Err(error) => (failed(Failure::of(error)), Locking::Over),
-                })
-            }
-            Locking::Held(lost) => Some((failed(Failure::of(lost.await)), Locking::Over)),
-            Locking::Over => None,
-        },
-    )
 }
 
 /// The state of a lock.

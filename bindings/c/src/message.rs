@@ -113,11 +113,17 @@ impl<'a> Draft<'a> {
         }
     }
 
+    /// Returns the names of the receivers.
+    pub(crate) fn receivers(&self) -> Result<Vec<&'a str>, Failure> {
+        let it = &self.message;
+        // SAFETY: The caller of `read` has promised it.
+        unsafe { texts(it.receivers, it.receiver_count, "a receiver") }
+    }
+
     /// Writes all parameters but the performative, the sender and the content into a message.
     pub(crate) fn complete(&self, mut builder: MessageBuilder) -> Result<MessageBuilder, Failure> {
         let it = &self.message;
-        // SAFETY: The caller of `read` has promised it.
-        let receivers = unsafe { texts(it.receivers, it.receiver_count, "a receiver") }?;
+        let receivers = self.receivers()?;
         if !receivers.is_empty() {
             builder = builder.replace_receivers(receivers);
         }

@@ -3,19 +3,17 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use fipa::Performative;
 use fipa::blocking::Wait;
-use fipa::protocol::{DialogueError, Keep, Subscription};
+use fipa::protocol::Keep;
 use fipa::topics::{Publisher, Topic, TopicLoan};
-use fipa::{Agent, MessageBuilder, Performative};
-use futures_core::Stream;
-use futures_util::stream::unfold;
 use parking_lot::Mutex;
 
 use crate::agent::OwnAgent;
 use crate::conversation::copied;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, OperationHandle, failed};
-use crate::message::{Draft, FipaMessage, Letter};
+use crate::item::{Event, OperationHandle, script};
+use crate::message::{Draft, FipaMessage};
 use crate::raw::{Extensible, FipaBytes, FipaText, Readable, limit, put, structure, writable};
 use crate::table::{self, FipaHandle};
 
@@ -208,52 +206,28 @@ pub unsafe extern "C" fn fipa_subscribe(
             None => Keep::Auto,
         };
         let timeout = limit(timeout_ms).unwrap_or(TIMEOUT);
-        let events = notifications(own.agent.clone(), message, keep, timeout);
+        let agent = own.agent.clone();
+        let events = script(async move |emitter| {
+            let subscribed = agent.subscribe_keeping(keep, message, timeout).await;
+            let mut subscription = subscribed.or_fail()?;
+            loop {
+                emitter
+                    .emit(match subscription.next().await {
+                        Ok(notification) => {
+                            let missed = notification.missed();
+                            Event::Notification(notification.into(), missed)
+                        }
+                        Err(error) if subscription.goes_on() => {
+                            Event::Interrupted(Failure::of(error))
+                        }
+                        Err(error) => return Err(Failure::of(error)),
+                    })
+                    .await;
+            }
+        });
         let began = OperationHandle::of(own.items.follow(tag, events));
         // SAFETY: The caller promises it.
         unsafe { put(operation, table::add(began), "the handle") }?;
         Ok(FipaResult::Ok)
     })
-}
-
-enum Reading {
-    Begin(Agent, MessageBuilder, Keep, Duration),
-    Next(Subscription),
-    Over,
-}
-
-fn notifications(
-    agent: Agent,
-    message: MessageBuilder,
-    keep: Keep,
-    timeout: Duration,
-) -> impl Stream<Item = Event> + Send {
-    unfold(
-        Reading::Begin(agent, message, keep, timeout),
-        async |state| {
-            let mut subscription = match state {
-                Reading::Begin(agent, message, keep, timeout) => {
-                    match agent.subscribe_keeping(keep, message, timeout).await {
-                        Ok(subscription) => subscription,
-                        Err(error) => return Some((failed(Failure::of(error)), Reading::Over)),
-                    }
-                }
-                Reading::Next(subscription) => subscription,
-                Reading::Over => return None,
-            };
-            let next: Result<_, DialogueError> = subscription.next().await;
-            Some(match next {
-                Ok(notification) => {
-                    let missed = notification.missed();
-                    let event = Event::Notification(Letter::from(notification), missed);
-                    (event, Reading::Next(subscription))
-                }
-                Err(error) if subscription.goes_on() => (
-                    Event::Interrupted(Failure::of(error)),
-                    Reading::Next(subscription),
-                ),
-                Err(error) => (failed(Failure::of(error)), Reading::Over),
-            })
-        },
-    )
 }

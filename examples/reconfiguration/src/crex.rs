@@ -230,7 +230,7 @@ impl Crex<'_> {
         let asked = async {
             // It leads as soon as the first item has founded the coalition.
             tokio::time::timeout(TIMEOUT, self.membership.leads()).await??;
-            let request = self
+            let mut request = self
                 .side
                 .agent
                 .request(self.membership.guard(ask)?, TIMEOUT)

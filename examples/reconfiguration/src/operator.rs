@@ -89,7 +89,7 @@ impl Operator<'_> {
             .agent
             .message(Performative::Request)
             .receiver(COALITION);
-        let request = self.agent.request(look.content("look"), TIMEOUT).await?;
+        let mut request = self.agent.request(look.content("look"), TIMEOUT).await?;
         request.result().await?;
         Ok(())
     }

@@ -82,6 +82,22 @@ static inline fipa_item next(fipa_handle domain, uint64_t tag, int32_t kind) {
   return item;
 }
 
+/* Takes two items, which come in any order: returns the one of the first kind; the other has no handle. */
+static inline fipa_item both(fipa_handle domain, uint64_t tag, int32_t kind, uint64_t other_tag,
+                             int32_t other) {
+  fipa_item items[2], wanted;
+  memset(items, 0, sizeof items);
+  for (int i = 0; i < 2; i++) {
+    items[i].size = sizeof *items;
+    OK(fipa_next(domain, LONG, &items[i]));
+  }
+  wanted = items[0].kind == kind ? items[0] : items[1];
+  CHECK(wanted.kind == kind && wanted.tag == tag);
+  wanted = items[0].kind == kind ? items[1] : items[0];
+  CHECK(wanted.kind == other && wanted.tag == other_tag && wanted.result == FIPA_RESULT_OK);
+  return items[0].kind == kind ? items[0] : items[1];
+}
+
 static inline int is_empty(fipa_handle domain) {
   fipa_item item;
   memset(&item, 0, sizeof item);

@@ -268,6 +268,138 @@ static void requests(void) {
   OK(fipa_close(server));
 }
 
+static void contract_nets(void) {
+  fipa_text to[2];
+  fipa_message carry;
+  fipa_handle server, task, calling, bids, proposal, wrong;
+  fipa_text json;
+  fipa_item item;
+  const size_t first = 0, beyond = 1;
+
+  to[0] = text("arm");
+  to[1] = text("missing");
+  carry = message("cfp", to, "carry");
+  carry.receiver_count = 2;
+  OK(fipa_serve(arm, text("fipa-contract-net"), 60, &server));
+  OK(fipa_begin_call(rover, &carry, LONG, 61, &calling));
+  task = next(domain, 60, FIPA_EVENT_TASK).handle;
+  CHECK(content_is(task, "carry"));
+  OK(fipa_begin_task_reply(task, FIPA_REPLY_PROPOSE, bytes("12"), 62));
+  item = next(domain, 61, FIPA_EVENT_BIDS);
+  bids = item.handle;
+  CHECK(item.number == 1);
+  OK(fipa_read_text(bids, &json));
+  CHECK(has(json, "\"unreached\":[\"missing\"]"));
+  OK(fipa_read_bid(bids, 0, &proposal));
+  CHECK(content_is(proposal, "12"));
+  OK(fipa_close(proposal));
+  CHECK(fipa_read_bid(bids, 1, &proposal) == FIPA_RESULT_INVALID);
+  CHECK(fipa_award(bids, &beyond, 1, bytes(""), LONG, 63) == FIPA_RESULT_INVALID);
+  OK(fipa_award(bids, &first, 1, bytes("go"), LONG, 63));
+  CHECK(fipa_award(bids, &first, 1, bytes("go"), LONG, 63) == FIPA_RESULT_CLOSED);
+  /* The decision, and the end of the reply. */
+  for (int i = 0; i < 2; i++) {
+    memset(&item, 0, sizeof item);
+    item.size = sizeof item;
+    OK(fipa_next(domain, LONG, &item));
+    CHECK(item.kind == FIPA_EVENT_DECISION ? item.handle == task && item.number == 1
+                                           : item.tag == 62 && item.result == FIPA_RESULT_OK);
+  }
+  OK(fipa_begin_task_reply(task, FIPA_REPLY_INFORM, bytes("carried"), 64));
+  for (int i = 0; i < 3; i++) {
+    memset(&item, 0, sizeof item);
+    item.size = sizeof item;
+    OK(fipa_next(domain, LONG, &item));
+    CHECK(item.result == FIPA_RESULT_OK);
+    if (item.kind == FIPA_EVENT_AWARDED) {
+      CHECK(item.number == 0 && content_is(item.handle, "carried"));
+      OK(fipa_close(item.handle));
+    } else {
+      CHECK(item.kind == FIPA_EVENT_ENDED);
+    }
+  }
+  CHECK(fipa_read_bid(task, 0, &wrong) == FIPA_RESULT_BAD_HANDLE);
+  OK(fipa_close(bids));
+  OK(fipa_close(task));
+  OK(fipa_close(calling));
+  OK(fipa_close(server));
+}
+
+static void actions(void) {
+  const char *navigate = "{\"name\": \"navigate\", \"description\": \"Drive to a place\", \"parameters\": ["
+                         "{\"name\": \"x\", \"type\": \"number\", \"unit\": \"m\","
+                         " \"range\": {\"min\": 0, \"max\": 10}}]}";
+  fipa_handle offer, asking, going, goal, nothing;
+  fipa_text json;
+  fipa_item item;
+
+  CHECK(fipa_offer(arm, text("{}"), 70, &offer) == FIPA_RESULT_INVALID);
+  CHECK(fipa_offer(arm, text("navigate"), 70, &offer) == FIPA_RESULT_INVALID);
+  OK(fipa_offer(arm, text(navigate), 70, &offer));
+  OK(fipa_begin_actions(rover, text("arm"), 71, &asking));
+  item = next(domain, 71, FIPA_EVENT_RESULT);
+  OK(fipa_read_text(item.handle, &json));
+  CHECK(has(json, "navigate") && has(json, "\"unit\":\"m\""));
+  OK(fipa_close(item.handle));
+  OK(fipa_close(asking));
+
+  /* Out of range: refused before the program sees it. */
+  OK(fipa_begin_goal(rover, text("arm"), text("navigate"), text("{\"x\": 11}"), 0, -1, 72, &going));
+  item = next(domain, 72, FIPA_EVENT_ENDED);
+  CHECK(item.result != FIPA_RESULT_OK);
+  OK(fipa_close(going));
+  CHECK(fipa_begin_goal(rover, text("arm"), text("navigate"), text("[1]"), 0, -1, 72, &nothing) ==
+        FIPA_RESULT_INVALID);
+
+  OK(fipa_begin_goal(rover, text("arm"), text("navigate"), text("{\"x\": 1.5}"), 0, -1, 73, &going));
+  goal = both(domain, 70, FIPA_EVENT_GOAL, 73, FIPA_EVENT_ACCEPTED).handle;
+  OK(fipa_read_text(goal, &json));
+  CHECK(is(json, "{\"x\":1.5}"));
+  OK(fipa_goal_progress(goal, text("{\"fraction\": 0.5, \"note\": \"half\", \"value\": [0.7, 2]}")));
+  CHECK(fipa_goal_progress(goal, text("{\"fraction\": \"half\"}")) == FIPA_RESULT_INVALID);
+  do {
+    item = next(domain, 73, FIPA_EVENT_PROGRESS);
+    OK(fipa_read_text(item.handle, &json));
+    CHECK(has(json, "\"state\":"));
+  } while (!has(json, "\"value\":[0.7,2]") && fipa_close(item.handle) == FIPA_RESULT_OK);
+  OK(fipa_close(item.handle));
+  CHECK(fipa_goal_end(goal, 1, text("{broken")) == FIPA_RESULT_INVALID);
+  OK(fipa_goal_end(goal, 1, text("{\"at\": 1.5}")));
+  CHECK(fipa_goal_end(goal, 0, text("late")) == FIPA_RESULT_CLOSED);
+  do {
+    memset(&item, 0, sizeof item);
+    item.size = sizeof item;
+    OK(fipa_next(domain, LONG, &item));
+    CHECK(item.tag == 73 && item.handle != 0);
+    OK(fipa_read_text(item.handle, &json));
+    CHECK(item.kind == FIPA_EVENT_PROGRESS || has(json, "\"at\":1.5"));
+    OK(fipa_close(item.handle));
+  } while (item.kind != FIPA_EVENT_RESULT);
+  OK(fipa_close(goal));
+  OK(fipa_close(going));
+
+  /* Cancelled: the robot stops, and says so. */
+  OK(fipa_begin_goal(rover, text("arm"), text("navigate"), text("{\"x\": 2}"), 0, -1, 74, &going));
+  goal = both(domain, 70, FIPA_EVENT_GOAL, 74, FIPA_EVENT_ACCEPTED).handle;
+  OK(fipa_cancel(going));
+  do {
+    memset(&item, 0, sizeof item);
+    item.size = sizeof item;
+    OK(fipa_next(domain, LONG, &item));
+    if (item.kind == FIPA_EVENT_STOP) {
+      CHECK(item.tag == 70 && item.handle == goal && item.result == FIPA_RESULT_CANCELLED);
+      OK(fipa_goal_end(goal, 0, text("stopped at 1")));
+    } else if (item.kind == FIPA_EVENT_PROGRESS) {
+      OK(fipa_close(item.handle));
+    } else {
+      CHECK(item.kind == FIPA_EVENT_ENDED && item.tag == 74 && item.result < 0);
+    }
+  } while (item.kind != FIPA_EVENT_ENDED);
+  OK(fipa_close(goal));
+  OK(fipa_close(going));
+  OK(fipa_close(offer));
+}
+
 static void topics(void) {
   fipa_text to = text("arm");
   fipa_message charge = message("subscribe", &to, "charge");
@@ -329,8 +461,12 @@ static void locks(const char *state_dir) {
 
   command.lock = lock;
   OK(fipa_send(rover, &command, -1, NULL));
+  /* Letters of the conversations before may come first. */
   OK(fipa_receive(arm, LONG, &letter));
-  CHECK(content_is(letter, "open"));
+  while (!content_is(letter, "open")) {
+    OK(fipa_close(letter));
+    OK(fipa_receive(arm, LONG, &letter));
+  }
   OK(fipa_check_fence(owned, letter));
   OK(fipa_close(lock));
   CHECK(fipa_send(rover, &command, -1, NULL) == FIPA_RESULT_BAD_HANDLE);
@@ -359,8 +495,9 @@ int main(int argc, char **argv) {
   items();
   directory();
   requests();
+  contract_nets();
+  actions();
   topics();
-  CHECK(fipa_receive(arm, 0, &listening) == FIPA_RESULT_EMPTY);
   locks(argv[2]);
 
   /* Closing an agent ends what waits for it, and closing the domain closes the rest. */

@@ -13,7 +13,7 @@ use fipa::admin::routes::{ASKER_TYPE, Connected, LostHost};
 use fipa::admin::stopped::StoppedAgent;
 use fipa::{
     Config, DirectoryView, Domain, Entry, Incarnation, Kind, Location, Matcher, Query, Reach, Role,
-    Signature, Source, Time,
+    Signature, Source,
 };
 use fipa_acl::{Pattern, escape, escape_name};
 use serde_json::{Value, json};

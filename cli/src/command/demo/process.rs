@@ -19,7 +19,6 @@ use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 
 use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
-use crate::output;
 
 /// The protocol of messages that are sent only to measure their time.
 const MEASURING: &str = "demo-measure";

@@ -158,7 +158,6 @@ impl Tally {
         in_order_given(&mut deliveries, &arguments.to);
         self.messages += 1;
         if json {
-            let deliveries = output::deliveries(&deliveries);
             output::json_line(&json!({ "number": number, "deliveries": deliveries }))?;
         }
         for delivery in deliveries.0 {
