@@ -206,8 +206,8 @@ pub(crate) unsafe fn fill<T: Extensible>(at: *mut T, value: T, what: &str) -> Re
     // SAFETY: `known` bytes are writable, as the caller promises, and lie within `value`.
     unsafe {
         ptr::copy_nonoverlapping(
-            ptr::from_ref(&value).cast::<u8>().add(skipped),
-            at.cast::<u8>().add(skipped),
+            ptr::from_ref(&value).cast::<u8>().wrapping_add(skipped),
+            at.cast::<u8>().wrapping_add(skipped),
             known - skipped,
         );
     }

@@ -6,8 +6,16 @@ use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 
-use fipa_testbed::can_run;
+use fipa::blocking::Wait;
+use fipa::config::Sources;
+use fipa::{Config, Domain, Performative};
+use fipa_testbed::{ChildGuard, can_run, until};
+use tempfile::TempDir;
+
+/// A deadline that a passing test does not reach.
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Builds the library, and returns the directory with it.
 fn library() -> PathBuf {
@@ -25,12 +33,19 @@ fn library() -> PathBuf {
     profile.to_owned()
 }
 
-/// Compiles and runs a program, with a domain of its own.
-fn run(program: &str, link: &[&str], under: &[&str]) {
+/// A compiled program with a domain of its own.
+struct Program {
+    dir: TempDir,
+    binary: PathBuf,
+    config: PathBuf,
+}
+
+/// Compiles a program with all warnings as errors.
+fn compile(source: &str, link: &[&str]) -> Program {
     let library = library();
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let dir = tempfile::tempdir().expect("a directory");
-    let binary = dir.path().join(program);
+    let binary = dir.path().join("program");
     let compiled = Command::new("cc")
         .args([
             "-std=c99",
@@ -44,7 +59,7 @@ fn run(program: &str, link: &[&str], under: &[&str]) {
         .arg(format!("-DVERSION=\"{}\"", env!("CARGO_PKG_VERSION")))
         .arg("-I")
         .arg(here.join("include"))
-        .arg(here.join("tests/c").join(program).with_extension("c"))
+        .arg(here.join(source))
         .arg("-o")
         .arg(&binary)
         .arg("-L")
@@ -63,20 +78,39 @@ fn run(program: &str, link: &[&str], under: &[&str]) {
     // The name under which the loader looks for it.
     let shared = dir.path().join("libfipa.so.0");
     std::os::unix::fs::symlink(library.join("libfipa_c.so"), shared).expect("a link");
-    let mut command = match under.split_first() {
-        Some((tool, arguments)) => {
-            let mut command = Command::new(tool);
-            command.args(arguments).arg(&binary);
-            command
-        }
-        None => Command::new(&binary),
-    };
+    Program {
+        dir,
+        binary,
+        config,
+    }
+}
+
+impl Program {
+    /// Returns a command that runs the program under a tool, if there is one.
+    fn command(&self, under: &[&str]) -> Command {
+        let mut command = match under.split_first() {
+            Some((tool, arguments)) => {
+                let mut command = Command::new(tool);
+                command.args(arguments).arg(&self.binary);
+                command
+            }
+            None => Command::new(&self.binary),
+        };
+        command.env("LD_LIBRARY_PATH", self.dir.path());
+        command.env("FIPA_CONFIG", &self.config);
+        command
+    }
+}
+
+/// Compiles and runs a program of the tests.
+fn run(program: &str, link: &[&str], under: &[&str]) {
+    let compiled = compile(&format!("tests/c/{program}.c"), link);
+    let mut command = compiled.command(under);
     let output = command
-        .arg(&config)
-        .arg(dir.path())
-        .env("LD_LIBRARY_PATH", dir.path())
-        .output()
-        .expect("the program runs");
+        .arg(&compiled.config)
+        .arg(compiled.dir.path())
+        .output();
+    let output = output.expect("the program runs");
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(
@@ -130,4 +164,39 @@ fn valgrind_finds_no_wrong_access_and_no_leak() {
     run("tour", SHARED, &[&memcheck[..], &leaks].concat());
     // Its forked child cannot free what belonged to threads of the parent.
     run("misuse", SHARED, &memcheck);
+}
+
+/// The example of the book, with an agent in Rust.
+#[test]
+fn an_agent_in_rust_requests_from_one_in_c() {
+    let arm = compile("examples/arm.c", SHARED);
+    let (mut process, ready) = ChildGuard::until_ready(&mut arm.command(&[]));
+    assert_eq!(ready.trim(), "arm_1 is ready");
+    let mut sources = Sources::from_environment();
+    sources.file = Some(arm.config.clone());
+    let config = Config::load(&sources).expect("the configuration is right");
+    let domain = Domain::open(&config).wait().expect("a domain");
+    let rover = domain.register("rover").wait().expect("a name");
+    let ask = |content: &'static str| {
+        let message = rover.message(Performative::Request).receiver("arm_1");
+        let request = rover.request(message.content(content), TIMEOUT).wait();
+        request.and_then(|mut request| request.result().wait())
+    };
+    let answer = ask("crate").expect("an answer");
+    assert_eq!(answer.text(), "lifted");
+    let refused = ask("").expect_err("nothing to lift");
+    assert!(refused.to_string().contains("lift what?"), "{refused}");
+    let subscribe = rover.message(Performative::Subscribe).receiver("arm_1");
+    let temperature = rover.subscribe(subscribe.content("temperature"), TIMEOUT);
+    let mut temperature = temperature.wait().expect("a subscription");
+    let first = temperature.next().wait().expect("a notification");
+    assert!(first.message().parse::<u32>().expect("a number") >= 20);
+
+    process.signal("-TERM");
+    let status = process.wait();
+    assert!(status.success(), "{status}");
+    until("the arm is deregistered", || {
+        domain.directory().lookup("arm_1").is_none()
+    });
+    domain.close().wait();
 }
