@@ -40,6 +40,21 @@ pub struct CoalitionState {
     pub leads: bool,
 }
 
+/// The changes of the state of a coalition; see [`Membership::changes`].
+#[derive(Debug)]
+pub struct CoalitionChanges {
+    state: watch::Receiver<State>,
+}
+
+impl CoalitionChanges {
+    /// Waits for the next change, and returns the state after it. Changes that follow each other while the caller does
+    /// not wait are one. Returns `None` after the membership has ended.
+    pub async fn next(&mut self) -> Option<CoalitionState> {
+        self.state.changed().await.ok()?;
+        Some(self.state.borrow_and_update().shown())
+    }
+}
+
 #[derive(Debug, Clone, Default)]
 struct State {
     members: Option<Members>,
@@ -117,14 +132,12 @@ impl Membership {
         self.state.borrow().shown()
     }
 
-    /// Waits until the state differs from the one that this method or the beginning of the membership returned last.
-    ///
-    /// # Errors
-    /// If the agent was deregistered.
-    pub async fn changed(&mut self) -> Result<CoalitionState, LockError> {
-        let changed = self.state.changed().await;
-        changed.map_err(|_| LockError::Closed)?;
-        Ok(self.state.borrow_and_update().shown())
+    /// Returns the changes of the state from now on.
+    #[must_use]
+    pub fn changes(&self) -> CoalitionChanges {
+        let mut state = self.state.clone();
+        state.mark_unchanged();
+        CoalitionChanges { state }
     }
 
     /// Waits until this agent leads.

@@ -46,7 +46,7 @@ use crate::agent::Agent;
 use crate::locks::LockError;
 
 pub use self::founder::{CoalitionOptions, FoundError, LedCoalition};
-pub use self::membership::{CoalitionState, Membership, NotLeaderError};
+pub use self::membership::{CoalitionChanges, CoalitionState, Membership, NotLeaderError};
 pub use self::turn::TURN;
 
 impl Agent {

@@ -121,7 +121,7 @@ enum fipa_event
    */
   FIPA_EVENT_LETTER = 2,
   /*
-   The directory has changed: `fipa_read_text`.
+   The directory or a coalition has changed: `fipa_read_text`.
    */
   FIPA_EVENT_CHANGE = 3,
   /*
@@ -386,10 +386,37 @@ typedef struct fipa_message {
    */
   size_t parameter_count;
   /*
-   The handle of a lock. The message then carries its fences. Zero in messages that are read.
+   The handle of a lock, or of the membership in a coalition that the agent leads. The message then carries its fences. Zero in messages that are read.
    */
   fipa_handle lock;
 } fipa_message;
+
+/*
+ How an agent owns a resource. A field that is zero has its default.
+ */
+typedef struct fipa_own_options {
+  /*
+   sizeof(struct fipa_own_options).
+   */
+  size_t size;
+  /*
+   Lease of a grant in milliseconds (15,000). A holder that ends without a proof delays the next one for this time.
+   */
+  int64_t lease_ms;
+  /*
+   Directory of the state file, which keeps fences rising over restarts. By default `$FIPA_STATE_DIR`, else `fipa`
+   in `$XDG_STATE_HOME`, else `~/.local/state/fipa`.
+   */
+  struct fipa_text state_dir;
+  /*
+   Not 0: without a state file. Each start then grants nothing for one lease, and for at least 15 s.
+   */
+  int32_t is_volatile;
+  /*
+   Not 0: an owner without a file grants at once, because no lock of an earlier run is in use.
+   */
+  int32_t forget;
+} fipa_own_options;
 
 /*
  How a process joins a domain. A field that is zero is not set.
@@ -466,33 +493,6 @@ typedef struct fipa_lock_info {
    */
   int32_t is_held;
 } fipa_lock_info;
-
-/*
- How an agent owns a resource. A field that is zero has its default.
- */
-typedef struct fipa_own_options {
-  /*
-   sizeof(struct fipa_own_options).
-   */
-  size_t size;
-  /*
-   Lease of a grant in milliseconds (15,000). A holder that ends without a proof delays the next one for this time.
-   */
-  int64_t lease_ms;
-  /*
-   Directory of the state file, which keeps fences rising over restarts. By default `$FIPA_STATE_DIR`, else `fipa`
-   in `$XDG_STATE_HOME`, else `~/.local/state/fipa`.
-   */
-  struct fipa_text state_dir;
-  /*
-   Not 0: without a state file. Each start then grants nothing for one lease, and for at least 15 s.
-   */
-  int32_t is_volatile;
-  /*
-   Not 0: an owner without a file grants at once, because no lock of an earlier run is in use.
-   */
-  int32_t forget;
-} fipa_own_options;
 
 /*
  Facts about a letter.
@@ -721,6 +721,49 @@ fipa_result fipa_receive(fipa_handle agent,
 fipa_result fipa_listen(fipa_handle agent,
                         uint64_t tag,
                         fipa_handle *operation);
+
+/*
+ Founds a coalition: one name for these agents. Letters to it go to the leader, the member that holds the lock
+ `coalition/NAME`, which this agent owns. `options` may be NULL, and is as for `fipa_own`. `fipa_close` dissolves it.
+
+ # Safety
+ The texts must be readable. `options` is NULL or as its documentation says. `coalition` is NULL or can be written.
+ */
+fipa_result fipa_found_coalition(fipa_handle agent,
+                                 struct fipa_text name,
+                                 const struct fipa_text *members,
+                                 size_t member_count,
+                                 const struct fipa_own_options *options,
+                                 fipa_handle *coalition);
+
+/*
+ Replaces the members of a coalition that an agent of this process has founded.
+
+ # Safety
+ The texts must be readable.
+ */
+fipa_result fipa_change_coalition(fipa_handle coalition,
+                                  const struct fipa_text *members,
+                                  size_t member_count);
+
+/*
+ Takes part in a coalition, which may be founded later: the agent leads when it is its turn. Each change is an item of
+ the kind `FIPA_EVENT_CHANGE`, a JSON text with `members`, `leader` (null if there is none at present) and `leads`.
+ While the agent leads, `lock` of a message may be this handle, and the message carries the fence of the leader;
+ `fipa_check_fence` with this handle checks the commands of a leader. `fipa_close` ends the membership.
+
+ # Safety
+ The text must be readable. `member` is NULL or can be written.
+ */
+fipa_result fipa_join_coalition(fipa_handle agent,
+                                struct fipa_text name,
+                                uint64_t tag,
+                                fipa_handle *member);
+
+/*
+ Gives up the lead of a coalition, if the agent leads. The other members are asked first to lead again.
+ */
+fipa_result fipa_resign(fipa_handle member);
 
 /*
  Calls the receivers of the message, names and patterns, for proposals. Waits for their answers up to `timeout_ms`
@@ -962,10 +1005,10 @@ fipa_result fipa_own(fipa_handle agent,
                      fipa_handle *owned);
 
 /*
- Checks the fence that a message carries (`lock` of `fipa_message`) for a resource that this agent owns. The result
- is `FIPA_RESULT_STALE` if the message must not be acted on.
+ Checks the fence that a message carries (`lock` of `fipa_message`) for a resource that this agent owns, or for a
+ coalition in which it takes part. The result is `FIPA_RESULT_STALE` if the message must not be acted on.
  */
-fipa_result fipa_check_fence(fipa_handle owned,
+fipa_result fipa_check_fence(fipa_handle guard,
                              fipa_handle letter);
 
 /*

@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 
 use crate::actions::{OpenGoal, OpenOffer};
 use crate::agent::OwnAgent;
+use crate::coalitions::CoalitionMember;
 use crate::contract_net::OpenCall;
 use crate::conversation::OpenServer;
 use crate::failure::{Failure, FipaResult, OrFail, call};
@@ -234,6 +235,8 @@ pub extern "C" fn fipa_close(handle: FipaHandle) -> FipaResult {
             operation.end();
         } else if let Some(offer) = object.downcast_ref::<OpenOffer>() {
             offer.end();
+        } else if let Some(member) = object.downcast_ref::<CoalitionMember>() {
+            member.end();
         } else if let Some(server) = object.downcast_ref::<OpenServer>() {
             server.end();
         } else if let Some(own) = object.downcast_ref::<OwnAgent>() {

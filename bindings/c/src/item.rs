@@ -32,7 +32,7 @@ pub enum FipaEvent {
     Outcomes = 1,
     /// A letter has arrived: `fipa_read_message`.
     Letter = 2,
-    /// The directory has changed: `fipa_read_text`.
+    /// The directory or a coalition has changed: `fipa_read_text`.
     Change = 3,
     /// The other agent has agreed to a request. There is no handle.
     Agreed = 4,

@@ -2,6 +2,7 @@
 
 mod actions;
 mod agent;
+mod coalitions;
 mod contract_net;
 mod conversation;
 mod domain;
@@ -16,6 +17,7 @@ mod topics;
 
 pub use crate::actions::*;
 pub use crate::agent::*;
+pub use crate::coalitions::*;
 pub use crate::contract_net::*;
 pub use crate::conversation::*;
 pub use crate::domain::*;

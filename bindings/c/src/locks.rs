@@ -3,11 +3,12 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use fipa::Agent;
 use fipa::blocking::Wait;
 use fipa::locks::{Lock, LockError, OwnOptions, Owned};
+use fipa::{Agent, MessageBuilder};
 
 use crate::agent::OwnAgent;
+use crate::coalitions::CoalitionMember;
 use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::item::{Event, OperationHandle, script};
 use crate::message::LetterRef;
@@ -194,35 +195,68 @@ pub unsafe extern "C" fn fipa_own(
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let resource = unsafe { resource.required("the resource") }?;
-        let mut chosen = OwnOptions::default();
-        if !options.is_null() {
-            // SAFETY: The caller promises it.
-            let options = unsafe { structure(options, "the options") }?;
-            if options.lease_ms != 0 {
-                let lease = limit(options.lease_ms);
-                chosen.lease = lease.ok_or_else(|| Failure::invalid("the lease is negative"))?;
-            }
-            // SAFETY: The caller promises it.
-            let dir = unsafe { options.state_dir.read("the state_dir") }?;
-            chosen.state_dir = dir.filter(|dir| !dir.is_empty()).map(PathBuf::from);
-            chosen.volatile = options.is_volatile != 0;
-            chosen.forget = options.forget != 0;
-        }
-        let open = OpenOwned(own.agent.own(resource, chosen).wait().or_fail()?);
+        // SAFETY: The caller promises it.
+        let options = unsafe { own_options(options) }?;
+        let open = OpenOwned(own.agent.own(resource, options).wait().or_fail()?);
         // SAFETY: The caller promises it.
         unsafe { put(owned, table::add(open), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
 
-/// Checks the fence that a message carries (`lock` of `fipa_message`) for a resource that this agent owns. The result
-/// is `FIPA_RESULT_STALE` if the message must not be acted on.
+/// Reads how an agent owns a resource; NULL means the defaults.
+///
+/// # Safety
+/// `options` is NULL or as its documentation says.
+pub(crate) unsafe fn own_options(options: *const FipaOwnOptions) -> Result<OwnOptions, Failure> {
+    let mut chosen = OwnOptions::default();
+    if options.is_null() {
+        return Ok(chosen);
+    }
+    // SAFETY: The caller promises it.
+    let options = unsafe { structure(options, "the options") }?;
+    if options.lease_ms != 0 {
+        let lease = limit(options.lease_ms);
+        chosen.lease = lease.ok_or_else(|| Failure::invalid("the lease is negative"))?;
+    }
+    // SAFETY: The caller promises it.
+    let dir = unsafe { options.state_dir.read("the state_dir") }?;
+    chosen.state_dir = dir.filter(|dir| !dir.is_empty()).map(PathBuf::from);
+    chosen.volatile = options.is_volatile != 0;
+    chosen.forget = options.forget != 0;
+    Ok(chosen)
+}
+
+/// Checks the fence that a message carries (`lock` of `fipa_message`) for a resource that this agent owns, or for a
+/// coalition in which it takes part. The result is `FIPA_RESULT_STALE` if the message must not be acted on.
 #[unsafe(no_mangle)]
-pub extern "C" fn fipa_check_fence(owned: FipaHandle, letter: FipaHandle) -> FipaResult {
+pub extern "C" fn fipa_check_fence(guard: FipaHandle, letter: FipaHandle) -> FipaResult {
     call(|| {
-        let owned = table::get::<OpenOwned>(owned)?;
+        let object = table::any(guard)?;
         let letter = LetterRef::of(letter)?;
-        owned.0.check(letter.get()?.message()).or_fail()?;
+        let message = letter.get()?.message();
+        if let Some(member) = object.downcast_ref::<CoalitionMember>() {
+            member.membership.check(message).or_fail()?;
+        } else {
+            let owned = object.downcast_ref::<OpenOwned>();
+            let owned = owned.ok_or_else(|| table::other_kind(guard, "OpenOwned"))?;
+            owned.0.check(message).or_fail()?;
+        }
         Ok(FipaResult::Ok)
     })
+}
+
+/// Adds the fences of a lock, or that of the leader of a coalition, to a message.
+pub(crate) fn guard(
+    handle: FipaHandle,
+    message: MessageBuilder,
+) -> Result<MessageBuilder, Failure> {
+    let object = table::any(handle)?;
+    if let Some(held) = object.downcast_ref::<HeldLock>() {
+        return Ok(held.lock.guard(message));
+    }
+    let member = object.downcast_ref::<CoalitionMember>();
+    let member = member.ok_or_else(|| table::other_kind(handle, "HeldLock"))?;
+    let guarded = member.membership.guard(message);
+    guarded.map_err(|error| Failure::new(FipaResult::Lost, error.to_string()))
 }

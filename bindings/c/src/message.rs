@@ -9,7 +9,7 @@ use fipa::{AgentId, Incoming, Kind, Message, MessageBuilder, Performative, Time}
 
 use crate::conversation::OpenTask;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::locks::HeldLock;
+use crate::locks::guard;
 use crate::raw::{self, Extensible, FipaBytes, FipaText, Readable, elements, fill, put, texts};
 use crate::table::{self, FipaHandle, Object};
 
@@ -66,7 +66,7 @@ pub struct FipaMessage {
     pub parameters: *const FipaParameter,
     /// Number of the user-defined parameters.
     pub parameter_count: usize,
-    /// The handle of a lock. The message then carries its fences. Zero in messages that are read.
+    /// The handle of a lock, or of the membership in a coalition that the agent leads. The message then carries its fences. Zero in messages that are read.
     pub lock: FipaHandle,
 }
 
@@ -168,7 +168,7 @@ impl<'a> Draft<'a> {
             builder = builder.user_defined(name, value.unwrap_or_default());
         }
         if it.lock != 0 {
-            builder = table::get::<HeldLock>(it.lock)?.lock.guard(builder);
+            builder = guard(it.lock, builder)?;
         }
         Ok(builder)
     }

@@ -67,6 +67,7 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
     })?;
     reporter.claim(Claim::Ready);
 
+    let mut changes = membership.changes();
     let mut crex = Crex {
         side: Side::new(part, agent, reporter),
         hardware: Hardware::connect(&part.world, &part.name).await?,
@@ -82,7 +83,7 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
                 Event::Letter(message) => crex.handle(&message).await?,
                 Event::Gone(agent) => crex.end(&format!("{agent} is gone")).await?,
             },
-            state = crex.membership.changed() => crex.changed(&state?),
+            Some(state) = changes.next() => crex.changed(&state),
             () = stop.requested() => break,
         }
     }

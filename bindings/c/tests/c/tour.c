@@ -482,6 +482,55 @@ static void locks(const char *state_dir) {
   OK(fipa_close(owned));
 }
 
+static void coalitions(const char *state_dir) {
+  fipa_text members[] = {text("rover"), text("arm")}, to = text("arm"), json;
+  fipa_handle founded, member, other, letter;
+  fipa_message command = message("inform", &to, "turn");
+  fipa_own_options options;
+  fipa_item item;
+  int leads = 0;
+
+  memset(&options, 0, sizeof options);
+  options.size = sizeof options;
+  options.state_dir = text(state_dir);
+  options.forget = 1;
+  CHECK(fipa_found_coalition(arm, text("team"), NULL, 0, &options, &founded) != FIPA_RESULT_OK);
+  OK(fipa_found_coalition(arm, text("team"), members, 2, &options, &founded));
+  OK(fipa_join_coalition(arm, text("team"), 80, &other));
+  OK(fipa_join_coalition(rover, text("team"), 81, &member));
+  while (!leads) {
+    memset(&item, 0, sizeof item);
+    item.size = sizeof item;
+    OK(fipa_next(domain, LONG, &item));
+    CHECK(item.kind == FIPA_EVENT_CHANGE);
+    OK(fipa_read_text(item.handle, &json));
+    leads = has(json, "\"leads\":true") ? (int)item.tag : 0;
+    OK(fipa_close(item.handle));
+  }
+  if (leads == 80) {
+    /* The rover leads after the arm. */
+    fipa_handle arms = other;
+    other = member;
+    member = arms;
+    to = text("rover");
+  }
+  command.lock = other;
+  CHECK(fipa_send(leads == 80 ? rover : arm, &command, -1, NULL) == FIPA_RESULT_LOST);
+  command.lock = member;
+  OK(fipa_send(leads == 80 ? arm : rover, &command, -1, NULL));
+  do {
+    OK(fipa_receive(leads == 80 ? rover : arm, LONG, &letter));
+  } while (!content_is(letter, "turn") && fipa_close(letter) == FIPA_RESULT_OK);
+  OK(fipa_check_fence(other, letter));
+  CHECK(fipa_check_fence(domain, letter) == FIPA_RESULT_BAD_HANDLE);
+  OK(fipa_close(letter));
+  OK(fipa_change_coalition(founded, members, 1));
+  OK(fipa_resign(member));
+  OK(fipa_close(member));
+  OK(fipa_close(other));
+  OK(fipa_close(founded));
+}
+
 int main(int argc, char **argv) {
   fipa_handle listening, letter;
   fipa_result result;
@@ -499,6 +548,7 @@ int main(int argc, char **argv) {
   actions();
   topics();
   locks(argv[2]);
+  coalitions(argv[2]);
 
   /* Closing an agent ends what waits for it, and closing the domain closes the rest. */
   OK(fipa_listen(arm, 50, &listening));
