@@ -929,6 +929,18 @@ fipa_result fipa_read_text(fipa_handle handle,
  */
 fipa_result fipa_close(fipa_handle handle);
 
+#if defined(FIPA_GATEWAY)
+/*
+ Runs the gateway of this host in the process, as `fipa up` does, with the configuration of `options` or, if that is
+ NULL, of the environment. Only in a library with the feature `gateway`. `fipa_close` ends it.
+
+ # Safety
+ `options` is NULL or as its documentation says. `gateway` is NULL or can be written.
+ */
+fipa_result fipa_open_gateway(const struct fipa_domain_options *options,
+                              fipa_handle *gateway);
+#endif
+
 /*
  Takes the next item of a domain; waits for it up to `timeout_ms`, or without a limit if that is negative. Returns
  `FIPA_RESULT_EMPTY` if there is none. Several threads may wait; each item goes to one of them.

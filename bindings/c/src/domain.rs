@@ -68,23 +68,10 @@ pub unsafe extern "C" fn fipa_open(
 ) -> FipaResult {
     call(|| {
         writable(domain, "the handle")?;
-        let mut sources = Sources::from_environment();
-        if !options.is_null() {
-            // SAFETY: The caller promises it.
-            let options = unsafe { structure(options, "the options") }?;
-            // SAFETY: The caller promises it.
-            let config = unsafe { options.config.read("the config") }?;
-            if let Some(config) = config.filter(|config| !config.is_empty()) {
-                sources.file = Some(PathBuf::from(config));
-            }
-            // SAFETY: The caller promises it.
-            let set = unsafe { texts(options.set, options.set_count, "a value in set") }?;
-            sources.set = set.into_iter().map(str::to_owned).collect();
-        }
+        // SAFETY: The caller promises it.
+        let (sources, config) = unsafe { configured(options) }?;
         blocking::start().or_fail()?;
-        let opened = Domain::open(&Config::load(&sources).or_fail()?)
-            .wait()
-            .or_fail()?;
+        let opened = Domain::open(&config).wait().or_fail()?;
         async { opened.follow(sources) }.wait();
         let membership = Membership {
             domain: opened,
@@ -94,6 +81,30 @@ pub unsafe extern "C" fn fipa_open(
         unsafe { put(domain, table::add(membership), "the handle") }?;
         Ok(FipaResult::Ok)
     })
+}
+
+/// Reads the configuration of a domain.
+///
+/// # Safety
+/// `options` is NULL or as its documentation says.
+pub(crate) unsafe fn configured(
+    options: *const FipaDomainOptions,
+) -> Result<(Sources, Config), Failure> {
+    let mut sources = Sources::from_environment();
+    if !options.is_null() {
+        // SAFETY: The caller promises it.
+        let options = unsafe { structure(options, "the options") }?;
+        // SAFETY: The caller promises it.
+        let config = unsafe { options.config.read("the config") }?;
+        if let Some(config) = config.filter(|config| !config.is_empty()) {
+            sources.file = Some(PathBuf::from(config));
+        }
+        // SAFETY: The caller promises it.
+        let set = unsafe { texts(options.set, options.set_count, "a value in set") }?;
+        sources.set = set.into_iter().map(str::to_owned).collect();
+    }
+    let config = Config::load(&sources).or_fail()?;
+    Ok((sources, config))
 }
 
 /// Returns the known agents of this host and of others as a JSON array, with the text as a handle
@@ -229,6 +240,10 @@ pub unsafe extern "C" fn fipa_read_text(handle: FipaHandle, text: *mut FipaText)
 pub extern "C" fn fipa_close(handle: FipaHandle) -> FipaResult {
     call(|| {
         let object = table::remove(handle)?;
+        #[cfg(feature = "gateway")]
+        if let Some(gateway) = object.downcast_ref::<crate::gateway::OpenGateway>() {
+            gateway.end();
+        }
         if let Some(membership) = object.downcast_ref::<Membership>() {
             membership.domain.clone().close().wait();
         } else if let Some(operation) = object.downcast_ref::<OperationHandle>() {

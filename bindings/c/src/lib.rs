@@ -8,6 +8,8 @@ mod conversation;
 mod domain;
 mod failure;
 mod fork;
+#[cfg(feature = "gateway")]
+mod gateway;
 mod item;
 mod locks;
 mod message;
@@ -22,6 +24,8 @@ pub use crate::contract_net::*;
 pub use crate::conversation::*;
 pub use crate::domain::*;
 pub use crate::failure::FipaResult;
+#[cfg(feature = "gateway")]
+pub use crate::gateway::*;
 pub use crate::item::*;
 pub use crate::locks::*;
 pub use crate::message::*;

@@ -17,20 +17,11 @@ use tempfile::TempDir;
 /// A deadline that a passing test does not reach.
 const TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Builds the library, and returns the directory with it.
+/// Returns the directory with the libraries that cargo has built for this test.
 fn library() -> PathBuf {
-    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let built = Command::new(env!("CARGO"))
-        .args(["build", "--locked", "--quiet", "-p", "fipa-c"])
-        .current_dir(here)
-        .status();
-    assert!(built.expect("cargo runs").success());
     let test = env::current_exe().expect("the test has a path");
-    let profile = test
-        .ancestors()
-        .nth(2)
-        .expect("the test is in target/debug/deps");
-    profile.to_owned()
+    let parent = test.parent().expect("the test is in target/debug/deps");
+    parent.to_owned()
 }
 
 /// A compiled program with a domain of its own.
@@ -57,6 +48,7 @@ fn compile(source: &str, link: &[&str]) -> Program {
             "-g",
         ])
         .arg(format!("-DVERSION=\"{}\"", env!("CARGO_PKG_VERSION")))
+        .args(cfg!(feature = "gateway").then_some("-DFIPA_GATEWAY"))
         .arg("-I")
         .arg(here.join("include"))
         .arg(here.join(source))

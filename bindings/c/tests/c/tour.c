@@ -531,6 +531,29 @@ static void coalitions(const char *state_dir) {
   OK(fipa_close(founded));
 }
 
+#ifdef FIPA_GATEWAY
+static void gateway(const char *config) {
+  fipa_text set = text("discovery.mdns=false"), json;
+  fipa_handle opened, second, agents;
+  fipa_domain_options options;
+  memset(&options, 0, sizeof options);
+  options.size = sizeof options;
+  options.config = text(config);
+  options.set = &set;
+  options.set_count = 1;
+  OK(fipa_open_gateway(&options, &opened));
+  CHECK(fipa_open_gateway(&options, &second) != FIPA_RESULT_OK);
+  CHECK(has(fipa_error(), "already running"));
+  OK(fipa_close(opened));
+  OK(fipa_open_gateway(&options, &opened));
+  OK(fipa_close(opened));
+  OK(fipa_agents(domain, text("rover"), text(""), &agents));
+  OK(fipa_read_text(agents, &json));
+  CHECK(has(json, "rover"));
+  OK(fipa_close(agents));
+}
+#endif
+
 int main(int argc, char **argv) {
   fipa_handle listening, letter;
   fipa_result result;
@@ -549,6 +572,9 @@ int main(int argc, char **argv) {
   topics();
   locks(argv[2]);
   coalitions(argv[2]);
+#ifdef FIPA_GATEWAY
+  gateway(argv[1]);
+#endif
 
   /* Closing an agent ends what waits for it, and closing the domain closes the rest. */
   OK(fipa_listen(arm, 50, &listening));

@@ -1,0 +1,44 @@
+//! A gateway in the process of the program.
+
+use fipa::Gateway;
+use fipa::blocking::{self, Wait};
+use parking_lot::Mutex;
+
+use crate::domain::{FipaDomainOptions, configured};
+use crate::failure::{FipaResult, OrFail, call};
+use crate::raw::{put, writable};
+use crate::table::{self, FipaHandle};
+
+/// A running gateway, until the caller closes it.
+pub(crate) struct OpenGateway(Mutex<Option<Gateway>>);
+
+impl OpenGateway {
+    pub(crate) fn end(&self) {
+        if let Some(gateway) = self.0.lock().take() {
+            gateway.close().wait();
+        }
+    }
+}
+
+/// Runs the gateway of this host in the process, as `fipa up` does, with the configuration of `options` or, if that is
+/// NULL, of the environment. Only in a library with the feature `gateway`. `fipa_close` ends it.
+///
+/// # Safety
+/// `options` is NULL or as its documentation says. `gateway` is NULL or can be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_open_gateway(
+    options: *const FipaDomainOptions,
+    gateway: *mut FipaHandle,
+) -> FipaResult {
+    call(|| {
+        writable(gateway, "the handle")?;
+        // SAFETY: The caller promises it.
+        let (_, config) = unsafe { configured(options) }?;
+        blocking::start().or_fail()?;
+        let opened = Gateway::open(&config).wait().or_fail()?;
+        let open = OpenGateway(Mutex::new(Some(opened)));
+        // SAFETY: The caller promises it.
+        unsafe { put(gateway, table::add(open), "the handle") }?;
+        Ok(FipaResult::Ok)
+    })
+}
