@@ -135,6 +135,11 @@ fn wrong_input_is_an_error_and_no_crash() {
 }
 
 #[test]
+fn threads_share_a_domain() {
+    run("threads", SHARED, &[]);
+}
+
+#[test]
 fn valgrind_finds_no_wrong_access_and_no_leak() {
     if !can_run(
         "valgrind_finds_no_wrong_access_and_no_leak",
@@ -188,6 +193,14 @@ fn an_agent_in_rust_requests_from_one_in_c() {
     let status = process.wait();
     assert!(status.success(), "{status}");
     until("the arm is deregistered", || {
+        domain.directory().lookup("arm_1").is_none()
+    });
+
+    // A killed process leaves no entry.
+    let (mut process, _) = ChildGuard::until_ready(&mut arm.command(&[]));
+    assert!(domain.directory().lookup("arm_1").is_some());
+    process.kill();
+    until("the entry of the killed arm is removed", || {
         domain.directory().lookup("arm_1").is_none()
     });
     domain.close().wait();
