@@ -386,7 +386,8 @@ typedef struct fipa_message {
    */
   size_t parameter_count;
   /*
-   The handle of a lock, or of the membership in a coalition that the agent leads. The message then carries its fences. Zero in messages that are read.
+   The handle of a lock, or of the membership in a coalition that the agent leads. The message then carries its
+   fences. Zero in messages that are read.
    */
   fipa_handle lock;
 } fipa_message;
@@ -635,9 +636,9 @@ fipa_result fipa_register(fipa_handle domain,
  Sends a message, and waits until each receiver has an outcome: at most `timeout_ms`, or the deadline of the
  configuration (`mts.deadline`) if it is negative. Letters leave in the order of the calls.
 
- The result is `FIPA_RESULT_NOT_DELIVERED` if a receiver has not got the letter; `fipa_error` lists the outcomes. With
- `outcomes`, the caller gets them as JSON (`fipa_read_text`): an array with an object per receiver, with `receiver`,
- `outcome` (`delivered`, `sent` or `failed`), `via` or `reason`, and the failed `attempts`.
+ The result is `FIPA_RESULT_NOT_DELIVERED` if a receiver has not got the letter; `fipa_error` lists the outcomes.
+ With `outcomes`, the caller gets them as JSON (`fipa_read_text`): an array with an object per receiver, with
+ `receiver`, `outcome` (`delivered`, `sent` or `failed`), `via` or `reason`, and the failed `attempts`.
 
  # Safety
  `message` is NULL or as its documentation says. `outcomes` is NULL or can be written.
@@ -701,8 +702,8 @@ fipa_result fipa_begin_send_loan(fipa_handle loan,
                                  uint64_t tag);
 
 /*
- Waits for the next letter of an agent, up to `timeout_ms`, or without a limit if it is negative. Returns `FIPA_RESULT_EMPTY` if
- none has arrived. The caller closes the letter.
+ Waits for the next letter of an agent, up to `timeout_ms`, or without a limit if it is negative. Returns
+ `FIPA_RESULT_EMPTY` if none has arrived. The caller closes the letter.
 
  # Safety
  `letter` is NULL or can be written.
@@ -712,8 +713,8 @@ fipa_result fipa_receive(fipa_handle agent,
                          fipa_handle *letter);
 
 /*
- Makes the letters of an agent items of the kind `FIPA_EVENT_LETTER`. They wait in the queue of the agent until `fipa_next`
- takes them. Closing the operation ends it, and no letter is lost.
+ Makes the letters of an agent items of the kind `FIPA_EVENT_LETTER`. They wait in the queue of the agent until
+ `fipa_next` takes them. Closing the operation ends it, and no letter is lost.
 
  # Safety
  `operation` is NULL or can be written.
@@ -747,10 +748,10 @@ fipa_result fipa_change_coalition(fipa_handle coalition,
                                   size_t member_count);
 
 /*
- Takes part in a coalition, which may be founded later: the agent leads when it is its turn. Each change is an item of
- the kind `FIPA_EVENT_CHANGE`, a JSON text with `members`, `leader` (null if there is none at present) and `leads`.
- While the agent leads, `lock` of a message may be this handle, and the message carries the fence of the leader;
- `fipa_check_fence` with this handle checks the commands of a leader. `fipa_close` ends the membership.
+ Takes part in a coalition, which may be founded later: the agent leads when it is its turn. Each change is an item
+ of the kind `FIPA_EVENT_CHANGE`, a JSON text with `members`, `leader` (null if there is none at present) and
+ `leads`. While the agent leads, `lock` of a message may be this handle, and the message carries the fence of the
+ leader; `fipa_check_fence` with this handle checks the commands of a leader. `fipa_close` ends the membership.
 
  # Safety
  The text must be readable. `member` is NULL or can be written.
@@ -819,8 +820,9 @@ fipa_result fipa_request(fipa_handle agent,
                          fipa_handle *answer);
 
 /*
- Begins a request as `fipa_request`, without waiting. Its items are `FIPA_EVENT_AGREED`, if the other agent agrees first, and
- then `FIPA_EVENT_ANSWER`, or `FIPA_EVENT_ENDED` with the failure. `fipa_cancel` cancels it; closing the operation only stops listening.
+ Begins a request as `fipa_request`, without waiting. Its items are `FIPA_EVENT_AGREED`, if the other agent agrees
+ first, and then `FIPA_EVENT_ANSWER`, or `FIPA_EVENT_ENDED` with the failure. `fipa_cancel` cancels it; closing the
+ operation only stops listening.
 
  # Safety
  `message` is NULL or as its documentation says. `operation` is NULL or can be written.
@@ -833,8 +835,8 @@ fipa_result fipa_begin_request(fipa_handle agent,
 
 /*
  Serves a protocol, such as `fipa-request` or `fipa-query`: each message that begins a conversation of it is an item
- of the kind `FIPA_EVENT_TASK`. The caller answers it with `fipa_task_reply` and closes it. A task that is closed without a last
- message ends with `failure`. Closing the server ends the acceptance of further conversations.
+ of the kind `FIPA_EVENT_TASK`. The caller answers it with `fipa_task_reply` and closes it. A task that is closed
+ without a last message ends with `failure`. Closing the server ends the acceptance of further conversations.
 
  # Safety
  The text must be readable. `server` is NULL or can be written.
@@ -846,7 +848,8 @@ fipa_result fipa_serve(fipa_handle agent,
 
 /*
  Sends a message of a conversation that this agent serves, with one of the acts of `fipa_reply`, and waits until it
- is delivered; a proposal, until it is decided on. After `FIPA_EVENT_CANCEL`, `FIPA_REPLY_INFORM` confirms the cancel.
+ is delivered; a proposal, until it is decided on. After `FIPA_EVENT_CANCEL`, `FIPA_REPLY_INFORM` confirms the
+ cancel.
 
  # Safety
  The content must be readable.
@@ -900,9 +903,9 @@ fipa_result fipa_routes(fipa_handle domain,
                         fipa_handle *routes);
 
 /*
- Follows the directory: each agent that joins, changes or leaves is an item of the kind `FIPA_EVENT_CHANGE`, with a JSON text.
- Its `change` is `joined`, `changed` or `left`, and `agent` is as in `fipa_agents`. It is `lagged`, without an agent,
- if the program was too slow and has missed changes. Closing the operation ends it.
+ Follows the directory: each agent that joins, changes or leaves is an item of the kind `FIPA_EVENT_CHANGE`, with a
+ JSON text. Its `change` is `joined`, `changed` or `left`, and `agent` is as in `fipa_agents`. It is `lagged`,
+ without an agent, if the program was too slow and has missed changes. Closing the operation ends it.
 
  # Safety
  `operation` is NULL or can be written.
@@ -954,8 +957,8 @@ fipa_result fipa_next(fipa_handle domain,
 
 /*
  Returns a descriptor for poll, epoll or an event loop. It is readable from before an item can be taken until
- `fipa_next` with a time limit of 0 has returned `FIPA_RESULT_EMPTY`. It may be readable without an item. The caller neither
- reads nor closes it, and stops polling it before it closes the domain.
+ `fipa_next` with a time limit of 0 has returned `FIPA_RESULT_EMPTY`. It may be readable without an item. The caller
+ neither reads nor closes it, and stops polling it before it closes the domain.
 
  # Safety
  `fd` is NULL or can be written.
@@ -964,8 +967,8 @@ fipa_result fipa_fd(fipa_handle domain,
                     int32_t *fd);
 
 /*
- Asks the other side to cancel the conversation of an operation. The operation then ends with `FIPA_RESULT_CANCELLED`, or with
- its result if the other side goes on.
+ Asks the other side to cancel the conversation of an operation. The operation then ends with
+ `FIPA_RESULT_CANCELLED`, or with its result if the other side goes on.
  */
 fipa_result fipa_cancel(fipa_handle operation);
 
@@ -983,9 +986,10 @@ fipa_result fipa_lock(fipa_handle agent,
                       fipa_handle *lock);
 
 /*
- Locks resources as `fipa_lock`, without waiting. The first item is `FIPA_EVENT_LOCK`, with the handle of the lock, or `FIPA_EVENT_ENDED`
- with the failure. After the lock, an item `FIPA_EVENT_ENDED` says that it was lost (`FIPA_RESULT_LOST`), or that it was released or the
- agent deregistered (`FIPA_RESULT_CLOSED`). Closing the operation before the lock withdraws the request.
+ Locks resources as `fipa_lock`, without waiting. The first item is `FIPA_EVENT_LOCK`, with the handle of the lock,
+ or `FIPA_EVENT_ENDED` with the failure. After the lock, an item `FIPA_EVENT_ENDED` says that it was lost
+ (`FIPA_RESULT_LOST`), or that it was released or the agent deregistered (`FIPA_RESULT_CLOSED`). Closing the
+ operation before the lock withdraws the request.
 
  # Safety
  The texts must be readable. `operation` is NULL or can be written.
@@ -1093,8 +1097,9 @@ fipa_result fipa_publish_loan(fipa_handle loan, size_t *subscribers);
 /*
  Subscribes to a topic: `message` has the publishing agent as its receiver and the name of the topic as its content.
  `keep` is empty, or says which notifications are wanted: `all`, or `latest N`. Each is an item of the kind
- `FIPA_EVENT_NOTIFICATION`. `FIPA_EVENT_INTERRUPTED` says that the publisher or its host is lost and the subscription goes on when it
- returns, and `FIPA_EVENT_ENDED` that the subscription has ended. Closing the operation cancels the subscription.
+ `FIPA_EVENT_NOTIFICATION`. `FIPA_EVENT_INTERRUPTED` says that the publisher or its host is lost and the subscription
+ goes on when it returns, and `FIPA_EVENT_ENDED` that the subscription has ended. Closing the operation cancels the
+ subscription.
 
  # Safety
  `message` is NULL or as its documentation says. The text must be readable. `operation` is NULL or can be written.

@@ -141,9 +141,9 @@ async fn outcomes_of(sending: Sending) -> Event {
 /// Sends a message, and waits until each receiver has an outcome: at most `timeout_ms`, or the deadline of the
 /// configuration (`mts.deadline`) if it is negative. Letters leave in the order of the calls.
 ///
-/// The result is `FIPA_RESULT_NOT_DELIVERED` if a receiver has not got the letter; `fipa_error` lists the outcomes. With
-/// `outcomes`, the caller gets them as JSON (`fipa_read_text`): an array with an object per receiver, with `receiver`,
-/// `outcome` (`delivered`, `sent` or `failed`), `via` or `reason`, and the failed `attempts`.
+/// The result is `FIPA_RESULT_NOT_DELIVERED` if a receiver has not got the letter; `fipa_error` lists the outcomes.
+/// With `outcomes`, the caller gets them as JSON (`fipa_read_text`): an array with an object per receiver, with
+/// `receiver`, `outcome` (`delivered`, `sent` or `failed`), `via` or `reason`, and the failed `attempts`.
 ///
 /// # Safety
 /// `message` is NULL or as its documentation says. `outcomes` is NULL or can be written.
@@ -297,8 +297,8 @@ pub extern "C" fn fipa_begin_send_loan(loan: FipaHandle, timeout_ms: i64, tag: u
     })
 }
 
-/// Waits for the next letter of an agent, up to `timeout_ms`, or without a limit if it is negative. Returns `FIPA_RESULT_EMPTY` if
-/// none has arrived. The caller closes the letter.
+/// Waits for the next letter of an agent, up to `timeout_ms`, or without a limit if it is negative. Returns
+/// `FIPA_RESULT_EMPTY` if none has arrived. The caller closes the letter.
 ///
 /// # Safety
 /// `letter` is NULL or can be written.
@@ -330,8 +330,8 @@ pub unsafe extern "C" fn fipa_receive(
     })
 }
 
-/// Makes the letters of an agent items of the kind `FIPA_EVENT_LETTER`. They wait in the queue of the agent until `fipa_next`
-/// takes them. Closing the operation ends it, and no letter is lost.
+/// Makes the letters of an agent items of the kind `FIPA_EVENT_LETTER`. They wait in the queue of the agent until
+/// `fipa_next` takes them. Closing the operation ends it, and no letter is lost.
 ///
 /// # Safety
 /// `operation` is NULL or can be written.

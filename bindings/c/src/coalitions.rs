@@ -89,10 +89,10 @@ pub unsafe extern "C" fn fipa_change_coalition(
     })
 }
 
-/// Takes part in a coalition, which may be founded later: the agent leads when it is its turn. Each change is an item of
-/// the kind `FIPA_EVENT_CHANGE`, a JSON text with `members`, `leader` (null if there is none at present) and `leads`.
-/// While the agent leads, `lock` of a message may be this handle, and the message carries the fence of the leader;
-/// `fipa_check_fence` with this handle checks the commands of a leader. `fipa_close` ends the membership.
+/// Takes part in a coalition, which may be founded later: the agent leads when it is its turn. Each change is an item
+/// of the kind `FIPA_EVENT_CHANGE`, a JSON text with `members`, `leader` (null if there is none at present) and
+/// `leads`. While the agent leads, `lock` of a message may be this handle, and the message carries the fence of the
+/// leader; `fipa_check_fence` with this handle checks the commands of a leader. `fipa_close` ends the membership.
 ///
 /// # Safety
 /// The text must be readable. `member` is NULL or can be written.

@@ -81,8 +81,9 @@ pub unsafe extern "C" fn fipa_request(
     })
 }
 
-/// Begins a request as `fipa_request`, without waiting. Its items are `FIPA_EVENT_AGREED`, if the other agent agrees first, and
-/// then `FIPA_EVENT_ANSWER`, or `FIPA_EVENT_ENDED` with the failure. `fipa_cancel` cancels it; closing the operation only stops listening.
+/// Begins a request as `fipa_request`, without waiting. Its items are `FIPA_EVENT_AGREED`, if the other agent agrees
+/// first, and then `FIPA_EVENT_ANSWER`, or `FIPA_EVENT_ENDED` with the failure. `fipa_cancel` cancels it; closing the
+/// operation only stops listening.
 ///
 /// # Safety
 /// `message` is NULL or as its documentation says. `operation` is NULL or can be written.
@@ -168,8 +169,8 @@ impl OpenServer {
 }
 
 /// Serves a protocol, such as `fipa-request` or `fipa-query`: each message that begins a conversation of it is an item
-/// of the kind `FIPA_EVENT_TASK`. The caller answers it with `fipa_task_reply` and closes it. A task that is closed without a last
-/// message ends with `failure`. Closing the server ends the acceptance of further conversations.
+/// of the kind `FIPA_EVENT_TASK`. The caller answers it with `fipa_task_reply` and closes it. A task that is closed
+/// without a last message ends with `failure`. Closing the server ends the acceptance of further conversations.
 ///
 /// # Safety
 /// The text must be readable. `server` is NULL or can be written.
@@ -328,7 +329,8 @@ impl OpenTask {
 }
 
 /// Sends a message of a conversation that this agent serves, with one of the acts of `fipa_reply`, and waits until it
-/// is delivered; a proposal, until it is decided on. After `FIPA_EVENT_CANCEL`, `FIPA_REPLY_INFORM` confirms the cancel.
+/// is delivered; a proposal, until it is decided on. After `FIPA_EVENT_CANCEL`, `FIPA_REPLY_INFORM` confirms the
+/// cancel.
 ///
 /// # Safety
 /// The content must be readable.

@@ -170,9 +170,9 @@ pub unsafe extern "C" fn fipa_routes(
     })
 }
 
-/// Follows the directory: each agent that joins, changes or leaves is an item of the kind `FIPA_EVENT_CHANGE`, with a JSON text.
-/// Its `change` is `joined`, `changed` or `left`, and `agent` is as in `fipa_agents`. It is `lagged`, without an agent,
-/// if the program was too slow and has missed changes. Closing the operation ends it.
+/// Follows the directory: each agent that joins, changes or leaves is an item of the kind `FIPA_EVENT_CHANGE`, with a
+/// JSON text. Its `change` is `joined`, `changed` or `left`, and `agent` is as in `fipa_agents`. It is `lagged`,
+/// without an agent, if the program was too slow and has missed changes. Closing the operation ends it.
 ///
 /// # Safety
 /// `operation` is NULL or can be written.

@@ -305,8 +305,8 @@ pub unsafe extern "C" fn fipa_next(
 }
 
 /// Returns a descriptor for poll, epoll or an event loop. It is readable from before an item can be taken until
-/// `fipa_next` with a time limit of 0 has returned `FIPA_RESULT_EMPTY`. It may be readable without an item. The caller neither
-/// reads nor closes it, and stops polling it before it closes the domain.
+/// `fipa_next` with a time limit of 0 has returned `FIPA_RESULT_EMPTY`. It may be readable without an item. The caller
+/// neither reads nor closes it, and stops polling it before it closes the domain.
 ///
 /// # Safety
 /// `fd` is NULL or can be written.
@@ -321,8 +321,8 @@ pub unsafe extern "C" fn fipa_fd(domain: FipaHandle, fd: *mut i32) -> FipaResult
     })
 }
 
-/// Asks the other side to cancel the conversation of an operation. The operation then ends with `FIPA_RESULT_CANCELLED`, or with
-/// its result if the other side goes on.
+/// Asks the other side to cancel the conversation of an operation. The operation then ends with
+/// `FIPA_RESULT_CANCELLED`, or with its result if the other side goes on.
 #[unsafe(no_mangle)]
 pub extern "C" fn fipa_cancel(operation: FipaHandle) -> FipaResult {
     call(|| {

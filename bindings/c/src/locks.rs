@@ -78,9 +78,10 @@ async fn acquire(
     }
 }
 
-/// Locks resources as `fipa_lock`, without waiting. The first item is `FIPA_EVENT_LOCK`, with the handle of the lock, or `FIPA_EVENT_ENDED`
-/// with the failure. After the lock, an item `FIPA_EVENT_ENDED` says that it was lost (`FIPA_RESULT_LOST`), or that it was released or the
-/// agent deregistered (`FIPA_RESULT_CLOSED`). Closing the operation before the lock withdraws the request.
+/// Locks resources as `fipa_lock`, without waiting. The first item is `FIPA_EVENT_LOCK`, with the handle of the lock,
+/// or `FIPA_EVENT_ENDED` with the failure. After the lock, an item `FIPA_EVENT_ENDED` says that it was lost
+/// (`FIPA_RESULT_LOST`), or that it was released or the agent deregistered (`FIPA_RESULT_CLOSED`). Closing the
+/// operation before the lock withdraws the request.
 ///
 /// # Safety
 /// The texts must be readable. `operation` is NULL or can be written.

@@ -66,7 +66,8 @@ pub struct FipaMessage {
     pub parameters: *const FipaParameter,
     /// Number of the user-defined parameters.
     pub parameter_count: usize,
-    /// The handle of a lock, or of the membership in a coalition that the agent leads. The message then carries its fences. Zero in messages that are read.
+    /// The handle of a lock, or of the membership in a coalition that the agent leads. The message then carries its
+    /// fences. Zero in messages that are read.
     pub lock: FipaHandle,
 }
 

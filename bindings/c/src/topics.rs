@@ -177,8 +177,9 @@ unsafe fn count(at: *mut usize, number: usize) -> Result<(), Failure> {
 
 /// Subscribes to a topic: `message` has the publishing agent as its receiver and the name of the topic as its content.
 /// `keep` is empty, or says which notifications are wanted: `all`, or `latest N`. Each is an item of the kind
-/// `FIPA_EVENT_NOTIFICATION`. `FIPA_EVENT_INTERRUPTED` says that the publisher or its host is lost and the subscription goes on when it
-/// returns, and `FIPA_EVENT_ENDED` that the subscription has ended. Closing the operation cancels the subscription.
+/// `FIPA_EVENT_NOTIFICATION`. `FIPA_EVENT_INTERRUPTED` says that the publisher or its host is lost and the subscription
+/// goes on when it returns, and `FIPA_EVENT_ENDED` that the subscription has ended. Closing the operation cancels the
+/// subscription.
 ///
 /// # Safety
 /// `message` is NULL or as its documentation says. The text must be readable. `operation` is NULL or can be written.
