@@ -2,122 +2,19 @@
 
 #![allow(clippy::expect_used, reason = "a failed precondition fails the test")]
 
-use std::env;
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 use fipa::blocking::Wait;
 use fipa::config::Sources;
 use fipa::{Config, Domain, Performative};
 use fipa_testbed::{ChildGuard, can_run, until};
-use tempfile::TempDir;
+
+use support::{C, SHARED, STATIC, Workshop, bindings, run, run_sanitized};
+
+mod support;
 
 /// A deadline that a passing test does not reach.
 const TIMEOUT: Duration = Duration::from_secs(60);
-
-/// Returns the directory with the libraries that cargo has built for this test.
-fn library() -> PathBuf {
-    let test = env::current_exe().expect("the test has a path");
-    let parent = test.parent().expect("the test is in target/debug/deps");
-    parent.to_owned()
-}
-
-/// A compiled program with a domain of its own.
-struct Program {
-    dir: TempDir,
-    binary: PathBuf,
-    config: PathBuf,
-}
-
-/// Compiles a program with all warnings as errors.
-fn compile(source: &str, link: &[&str]) -> Program {
-    let library = library();
-    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let dir = tempfile::tempdir().expect("a directory");
-    let binary = dir.path().join("program");
-    let compiled = Command::new("cc")
-        .args([
-            "-std=c99",
-            "-D_POSIX_C_SOURCE=200809L",
-            "-Wall",
-            "-Wextra",
-            "-Werror",
-            "-pedantic",
-            "-g",
-        ])
-        .arg(format!("-DVERSION=\"{}\"", env!("CARGO_PKG_VERSION")))
-        .args(cfg!(feature = "gateway").then_some("-DFIPA_GATEWAY"))
-        .arg("-I")
-        .arg(here.join("include"))
-        .arg(here.join(source))
-        .arg("-o")
-        .arg(&binary)
-        .arg("-L")
-        .arg(&library)
-        .args(link)
-        .args(["-lpthread", "-ldl", "-lm"])
-        .status();
-    assert!(compiled.expect("cc runs").success());
-
-    let config = dir.path().join("fipa.toml");
-    let text = format!(
-        "domain = \"test\"\nruntime_dir = \"{}\"\n",
-        dir.path().join("run").display()
-    );
-    fs::write(&config, text).expect("the configuration can be written");
-    // The name under which the loader looks for it.
-    let shared = dir.path().join("libfipa.so.0");
-    std::os::unix::fs::symlink(library.join("libfipa_c.so"), shared).expect("a link");
-    Program {
-        dir,
-        binary,
-        config,
-    }
-}
-
-impl Program {
-    /// Returns a command that runs the program under a tool, if there is one.
-    fn command(&self, under: &[&str]) -> Command {
-        let mut command = match under.split_first() {
-            Some((tool, arguments)) => {
-                let mut command = Command::new(tool);
-                command.args(arguments).arg(&self.binary);
-                command
-            }
-            None => Command::new(&self.binary),
-        };
-        command.env("LD_LIBRARY_PATH", self.dir.path());
-        command.env("FIPA_CONFIG", &self.config);
-        command
-    }
-}
-
-/// Compiles and runs a program of the tests.
-fn run(program: &str, link: &[&str], under: &[&str]) {
-    let compiled = compile(&format!("tests/c/{program}.c"), link);
-    let mut command = compiled.command(under);
-    let output = command
-        .arg(&compiled.config)
-        .arg(compiled.dir.path())
-        .output();
-    let output = output.expect("the program runs");
-    let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(
-        output.status.success(),
-        "{program}: {}\n{text}{errors}",
-        output.status
-    );
-    assert!(
-        text.ends_with("all steps passed\n"),
-        "{program}: {text}{errors}"
-    );
-}
-
-const SHARED: &[&str] = &["-lfipa_c"];
-const STATIC: &[&str] = &["-l:libfipa_c.a"];
 
 #[test]
 fn each_call_works_with_the_shared_library() {
@@ -163,14 +60,22 @@ fn valgrind_finds_no_wrong_access_and_no_leak() {
     run("misuse", SHARED, &memcheck);
 }
 
+#[test]
+fn sanitizers_find_no_wrong_access() {
+    run_sanitized("tour", "detect_leaks=1");
+    // Its forked child has no copy of the threads of the parent. What belonged to them counts as leaked.
+    run_sanitized("misuse", "detect_leaks=0");
+}
+
 /// The example of the book, with an agent in Rust.
 #[test]
 fn an_agent_in_rust_requests_from_one_in_c() {
-    let arm = compile("examples/arm.c", SHARED);
-    let (mut process, ready) = ChildGuard::until_ready(&mut arm.command(&[]));
+    let workshop = Workshop::new();
+    let arm = workshop.compile("cc", &bindings("c/examples/arm.c"), "arm", C, SHARED);
+    let (mut process, ready) = ChildGuard::until_ready(&mut workshop.command(&arm, &[]));
     assert_eq!(ready.trim(), "arm_1 is ready");
     let mut sources = Sources::from_environment();
-    sources.file = Some(arm.config.clone());
+    sources.file = Some(workshop.config());
     let config = Config::load(&sources).expect("the configuration is right");
     let domain = Domain::open(&config).wait().expect("a domain");
     let rover = domain.register("rover").wait().expect("a name");
@@ -197,7 +102,7 @@ fn an_agent_in_rust_requests_from_one_in_c() {
     });
 
     // A killed process leaves no entry.
-    let (mut process, _) = ChildGuard::until_ready(&mut arm.command(&[]));
+    let (mut process, _) = ChildGuard::until_ready(&mut workshop.command(&arm, &[]));
     assert!(domain.directory().lookup("arm_1").is_some());
     process.kill();
     until("the entry of the killed arm is removed", || {

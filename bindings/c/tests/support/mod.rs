@@ -1,0 +1,160 @@
+//! Compiles and runs programs in C and C++ against the library.
+
+#![allow(dead_code, reason = "each file of tests uses a part")]
+
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::LazyLock;
+
+/// The directory with the library, which is built first.
+static LIBRARY: LazyLock<PathBuf> = LazyLock::new(|| {
+    let built = Command::new(env!("CARGO"))
+        .args(["build", "--locked", "--quiet", "-p", "fipa-c"])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .status();
+    assert!(built.expect("cargo runs").success());
+    let test = env::current_exe().expect("the test has a path");
+    let profile = test
+        .ancestors()
+        .nth(2)
+        .expect("the test is in target/debug/deps");
+    profile.to_owned()
+});
+
+pub(crate) const SHARED: &[&str] = &["-lfipa_c"];
+pub(crate) const STATIC: &[&str] = &["-l:libfipa_c.a", "-lpthread", "-ldl", "-lm"];
+
+/// The warnings of C.
+pub(crate) const C: &[&str] = &[
+    "-std=c99",
+    "-D_POSIX_C_SOURCE=200809L",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+    "-pedantic",
+    "-g",
+];
+
+/// Returns the directory with the library.
+pub(crate) fn library() -> &'static Path {
+    &LIBRARY
+}
+
+/// Returns the path of a file or a folder in `bindings`.
+pub(crate) fn bindings(path: &str) -> PathBuf {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    here.parent().expect("bindings").join(path)
+}
+
+/// A directory for programs, with the configuration of a domain of their own.
+pub(crate) struct Workshop {
+    dir: tempfile::TempDir,
+}
+
+impl Workshop {
+    pub(crate) fn new() -> Self {
+        let dir = tempfile::tempdir().expect("a directory");
+        let text = format!(
+            "domain = \"test\"\nruntime_dir = \"{}\"\n",
+            dir.path().join("run").display()
+        );
+        fs::write(dir.path().join("fipa.toml"), text).expect("the configuration can be written");
+        // The name under which the loader looks for the library.
+        let shared = dir.path().join("libfipa.so.0");
+        std::os::unix::fs::symlink(library().join("libfipa_c.so"), shared).expect("a link");
+        Self { dir }
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        self.dir.path()
+    }
+
+    pub(crate) fn config(&self) -> PathBuf {
+        self.dir.path().join("fipa.toml")
+    }
+
+    /// Compiles a source with all headers in reach, and returns the program or what `flags` say to make.
+    pub(crate) fn compile(
+        &self,
+        compiler: &str,
+        source: &Path,
+        name: &str,
+        flags: &[&str],
+        link: &[&str],
+    ) -> PathBuf {
+        let made = self.dir.path().join(name);
+        let compiled = Command::new(compiler)
+            .args(flags)
+            .arg(format!("-DVERSION=\"{}\"", env!("CARGO_PKG_VERSION")))
+            .arg("-I")
+            .arg(bindings("c/include"))
+            .arg("-I")
+            .arg(bindings("cpp/include"))
+            .arg(source)
+            .arg("-o")
+            .arg(&made)
+            .arg("-L")
+            .arg(library())
+            .args(link)
+            .status();
+        assert!(
+            compiled.expect("the compiler runs").success(),
+            "{compiler} {flags:?} {}",
+            source.display()
+        );
+        made
+    }
+
+    /// Returns the command of a program, under a tool with arguments if there is one.
+    pub(crate) fn command(&self, program: &Path, under: &[&str]) -> Command {
+        let mut command = match under.split_first() {
+            Some((tool, arguments)) => {
+                let mut command = Command::new(tool);
+                command.args(arguments).arg(program);
+                command
+            }
+            None => Command::new(program),
+        };
+        command
+            .arg(self.config())
+            .arg(self.path())
+            .env("FIPA_CONFIG", self.config())
+            .env("LD_LIBRARY_PATH", self.path());
+        command
+    }
+}
+
+/// Runs a program to its end, and checks that it has passed all its steps.
+pub(crate) fn passes(command: &mut Command) {
+    let output = command.output().expect("the program runs");
+    let text = String::from_utf8_lossy(&output.stdout);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(
+        output.status.success() && text.ends_with("all steps passed\n"),
+        "{command:?}: {}\n{text}{errors}",
+        output.status
+    );
+}
+
+/// Compiles and runs a program of `tests/c`, with a domain of its own.
+pub(crate) fn run(program: &str, link: &[&str], under: &[&str]) {
+    let workshop = Workshop::new();
+    let source = bindings("c/tests/c").join(program).with_extension("c");
+    let binary = workshop.compile("cc", &source, program, C, link);
+    passes(&mut workshop.command(&binary, under));
+}
+
+/// Compiles and runs a program of `tests/c` with the sanitizers of the compiler. The library itself has none.
+pub(crate) fn run_sanitized(program: &str, options: &str) {
+    let workshop = Workshop::new();
+    let source = bindings("c/tests/c").join(program).with_extension("c");
+    let flags = [C, SANITIZERS].concat();
+    let binary = workshop.compile("cc", &source, program, &flags, SHARED);
+    passes(workshop.command(&binary, &[]).env("ASAN_OPTIONS", options));
+}
+
+/// A finding ends the program with an error.
+pub(crate) const SANITIZERS: &[&str] =
+    &["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
