@@ -39,6 +39,23 @@ fn each_class_works_and_sanitizers_find_no_wrong_access_and_no_leak() {
     );
 }
 
+/// The memory of the library comes from the allocator that the sanitizer watches.
+#[test]
+fn the_sanitizer_finds_a_content_that_is_read_after_its_letter() {
+    let workshop = Workshop::new();
+    let flags = [&["-std=c++17"], SANITIZERS].concat();
+    let source = bindings("cpp/tests/dangling.cpp");
+    let program = compile(&workshop, &source, "dangling", &flags);
+    let output = workshop
+        .command(&program, &[])
+        .env("ASAN_OPTIONS", "detect_leaks=0")
+        .output()
+        .expect("the program runs");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(!output.status.success(), "{output:?}");
+    assert!(errors.contains("heap-use-after-free"), "{errors}");
+}
+
 #[test]
 fn each_class_works_in_cpp20_without_exceptions() {
     let workshop = Workshop::new();
@@ -64,7 +81,7 @@ fn the_header_compiles_with_each_compiler_and_standard() {
             for exceptions in ["-fexceptions", "-fno-exceptions"] {
                 let flags = [standard, exceptions, "-xc++", "-fsyntax-only"];
                 let flags = [WARNINGS, &flags].concat();
-                // The header alone is complete. As the main file it has `#pragma once`-free guards only.
+                // The header alone is complete.
                 workshop.compile(compiler, &header, "none", &flags, &[]);
             }
         }

@@ -213,6 +213,10 @@ class limit {
   template <class Rep, class Period>
   constexpr limit(std::chrono::duration<Rep, Period> duration) noexcept
       : milliseconds_(rounded(duration)) {}
+  /// A limit, or none.
+  template <class Rep, class Period>
+  constexpr limit(const std::optional<std::chrono::duration<Rep, Period>>& duration) noexcept
+      : milliseconds_(duration ? rounded(*duration) : -1) {}
 
   /// Returns the number for the C interface: -1 without a limit.
   [[nodiscard]] constexpr std::int64_t milliseconds() const noexcept { return milliseconds_; }
@@ -234,7 +238,7 @@ class limit {
 
 /// Waits without a limit.
 inline constexpr limit unlimited{std::nullopt};
-/// The limit of the configuration, for calls that send.
+/// The limit of the configuration (`mts.deadline`) for calls that send, 30 s for a subscription.
 inline constexpr limit as_configured{std::nullopt};
 /// Does not wait.
 inline constexpr limit at_once{std::chrono::milliseconds(0)};
@@ -1183,6 +1187,8 @@ class item {
   [[nodiscard]] result<task> take_task() { return take<task>(kind_ == event::task); }
   /// Takes the lock out.
   [[nodiscard]] result<lock> take_lock() { return take<lock>(kind_ == event::lock); }
+  /// Takes the handle out, for the C interface. The caller closes it. Zero if there is none.
+  [[nodiscard]] fipa_handle release() noexcept { return owner_.release(); }
   /// Takes the outcomes or the change out.
   [[nodiscard]] result<json> take_json() {
     return take<json>(kind_ == event::outcomes || kind_ == event::change);

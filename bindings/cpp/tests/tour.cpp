@@ -48,6 +48,8 @@ static_assert(fipa::limit(-1s).milliseconds() == 0 && fipa::limit(0.5s).millisec
 static_assert(fipa::limit(std::chrono::hours::max()).milliseconds() == 3'153'600'000'000);
 static_assert(fipa::unlimited.milliseconds() == -1 && fipa::limit(std::nullopt).milliseconds() < 0);
 static_assert(fipa::at_once.milliseconds() == 0);
+static_assert(fipa::limit(std::optional(3ms)).milliseconds() == 3);
+static_assert(fipa::limit(std::optional<std::chrono::seconds>()).milliseconds() == -1);
 
 #if defined(__cpp_lib_span)
 static_assert(std::is_convertible_v<fipa::bytes, std::span<const std::byte>>);
@@ -312,9 +314,11 @@ static void items(const fipa::domain& domain, const fipa::agent& rover, const fi
   CHECK(take(arm.receive(step)));
 
   CHECK(rover.begin_send({"inform", "missing", "1"}, 3, 100ms));
-  const auto failed = next(domain, 3, event::outcomes);
+  auto failed = next(domain, 3, event::outcomes);
   CHECK(!failed.succeeded() && failed.error().code() == errc::not_delivered);
   CHECK(has(failed.error().text(), "missing"));
+  const auto details = fipa::json::adopt(failed.release());
+  CHECK(has(details.view(), "missing") && failed.release() == 0 && !failed.take_json());
   CHECK(take(rover.receive(step)));
 }
 
