@@ -59,7 +59,7 @@ class driver {
         begin(item.take_task().value());
         break;
       case fipa::event::cancel:
-        if (item.task_id() == task_.id()) {
+        if (item.refers_to() == task_.id()) {
           arm_.target = arm_.position;
           end(fipa::reply::inform, "stopped");
         }

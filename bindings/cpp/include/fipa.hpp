@@ -500,6 +500,13 @@ class handle {
   fipa_handle raw_ = 0;
 };
 
+/// The text of a handle; empty without a handle.
+inline std::string_view read_text(fipa_handle raw) noexcept {
+  fipa_text text{};
+  if (raw != 0) fipa_read_text(raw, &text);
+  return view(text);
+}
+
 /// The result of a call that has written a handle.
 template <class Owner>
 result<Owner> owned(fipa_result code, fipa_handle raw) {
@@ -553,11 +560,7 @@ class json : public detail::handle<json> {
   json() noexcept {}
 
   /// Returns the text, which is valid as long as this object.
-  [[nodiscard]] std::string_view view() const& noexcept {
-    fipa_text text{};
-    if (raw() != 0) fipa_read_text(raw(), &text);
-    return detail::view(text);
-  }
+  [[nodiscard]] std::string_view view() const& noexcept { return detail::read_text(raw()); }
   /// A view of a temporary object would be invalid at once.
   std::string_view view() const&& = delete;
   /// Returns a copy.
@@ -756,6 +759,8 @@ enum class reply : std::int32_t {
   failure = FIPA_REPLY_FAILURE,
   /// An `inform` after which the conversation goes on.
   notify = FIPA_REPLY_NOTIFY,
+  /// A proposal. The decision is `event::decision`.
+  propose = FIPA_REPLY_PROPOSE,
 };
 
 /// A conversation that an agent serves. It ends with `failure` if the object is destroyed before a
@@ -765,9 +770,9 @@ class task : public detail::readable<task> {
   /// Without a task.
   task() noexcept {}
 
-  /// Returns the number that `item::task_id` has if the task is cancelled.
+  /// Returns the number that `item::refers_to` has in items about this task.
   [[nodiscard]] std::uint64_t id() const noexcept { return raw(); }
-  /// Sends a message, and waits until it is delivered.
+  /// Sends a message, and waits until it is delivered; a proposal, until it is decided on.
   result<void> send(reply act, bytes content = {}) const {
     return detail::checked(
         fipa_task_reply(raw(), static_cast<std::int32_t>(act), detail::raw(content)));
@@ -786,6 +791,66 @@ class task : public detail::readable<task> {
   result<void> begin_send(reply act, bytes content, std::uint64_t tag) const {
     return detail::checked(
         fipa_begin_task_reply(raw(), static_cast<std::int32_t>(act), detail::raw(content), tag));
+  }
+};
+
+/// The answers to a call for proposals. Without an award, all proposals are rejected when the
+/// object is destroyed.
+class bids : public detail::handle<bids> {
+ public:
+  /// Without answers.
+  bids() noexcept {}
+
+  /// Returns a proposal, with an index from 0 to below `item::number`.
+  [[nodiscard]] result<letter> proposal(std::size_t index) const {
+    fipa_handle read = 0;
+    const auto code = fipa_read_bid(raw(), index, &read);
+    return detail::owned<letter>(code, read);
+  }
+  /// Returns the other answers in JSON, valid as long as this object: see `fipa_read_bid`.
+  [[nodiscard]] std::string_view others() const& noexcept { return detail::read_text(raw()); }
+  /// A text of a temporary object would be invalid at once.
+  std::string_view others() const&& = delete;
+  /// Accepts the proposals of these indices, and rejects the others; each gets the content. The
+  /// items are `event::awarded` per accepted proposal, and then `event::ended`.
+  result<void> award(const std::vector<std::size_t>& accepted, bytes content, std::uint64_t tag,
+                     limit within = unlimited) const {
+    return detail::checked(fipa_award(raw(), accepted.data(), accepted.size(),
+                                      detail::raw(content), within.milliseconds(), tag));
+  }
+};
+
+/// An action that an agent offers. It is withdrawn, and its goals are cancelled, when the object is
+/// destroyed.
+class offer : public detail::handle<offer> {
+ public:
+  /// Without an action.
+  offer() noexcept {}
+};
+
+/// A goal of an action that this agent offers. It fails if the object is destroyed before its end.
+class goal : public detail::handle<goal> {
+ public:
+  /// Without a goal.
+  goal() noexcept {}
+
+  /// Returns the number that `item::refers_to` has if the goal is to stop.
+  [[nodiscard]] std::uint64_t id() const noexcept { return raw(); }
+  /// Returns the arguments in JSON, valid as long as this object.
+  [[nodiscard]] std::string_view arguments() const& noexcept { return detail::read_text(raw()); }
+  /// A text of a temporary object would be invalid at once.
+  std::string_view arguments() const&& = delete;
+  /// Reports the progress: a JSON object with `fraction`, `note` and `value`, each optional.
+  result<void> progress(std::string_view json) const {
+    return detail::checked(fipa_goal_progress(raw(), detail::text(json)));
+  }
+  /// Ends the goal with its result, a value in JSON or an empty text.
+  result<void> succeed(std::string_view json = {}) const {
+    return detail::checked(fipa_goal_end(raw(), 1, detail::text(json)));
+  }
+  /// Ends the goal with a failure.
+  result<void> fail(std::string_view reason) const {
+    return detail::checked(fipa_goal_end(raw(), 0, detail::text(reason)));
   }
 };
 
@@ -820,6 +885,17 @@ class lock : public detail::handle<lock> {
   /// A text of a temporary object would be invalid at once.
   result<lock_state> state() const&& = delete;
 };
+
+namespace detail {
+
+/// The handle of a lock that a message carries. A lock that is empty gives no handle that exists:
+/// the call must not send without the fence.
+inline fipa_handle guard(const lock* held) noexcept {
+  if (held == nullptr) return 0;
+  return *held ? held->raw() : ~fipa_handle{0};
+}
+
+}  // namespace detail
 
 /// A resource that an agent owns until the object is destroyed.
 class owned_resource : public detail::handle<owned_resource> {
@@ -1063,6 +1139,44 @@ class agent : public detail::handle<agent> {
     return detail::owned<server>(code, made);
   }
 
+  /// Calls the receivers, names and patterns, for proposals, with a limit of 10 s if none is set.
+  /// The item is `event::bids`, or `event::ended` with the failure.
+  [[nodiscard]] result<operation> begin_call(const fipa::message& message, std::uint64_t tag,
+                                             limit within = as_configured) const {
+    const detail::raw_message raw_message(message);
+    fipa_handle begun = 0;
+    const auto code =
+        fipa_begin_call(raw(), raw_message.get(), within.milliseconds(), tag, &begun);
+    return detail::owned<operation>(code, begun);
+  }
+
+  /// Offers an action, which a JSON object describes: see `fipa_offer`. The items are `event::goal`
+  /// and `event::stop`.
+  [[nodiscard]] result<fipa::offer> offer(std::string_view description, std::uint64_t tag) const {
+    fipa_handle made = 0;
+    const auto code = fipa_offer(raw(), detail::text(description), tag, &made);
+    return detail::owned<fipa::offer>(code, made);
+  }
+  /// Lists the actions of a robot. The item is `event::result`, or `event::ended` with the failure.
+  [[nodiscard]] result<operation> begin_actions(std::string_view robot, std::uint64_t tag) const {
+    fipa_handle begun = 0;
+    const auto code = fipa_begin_actions(raw(), detail::text(robot), tag, &begun);
+    return detail::owned<operation>(code, begun);
+  }
+  /// Invokes an action of a robot. `arguments` is empty or a JSON object. The goal carries the
+  /// fence of `guard`, if there is one. The items are `event::accepted`, `event::progress`, and
+  /// then `event::result`, or `event::ended` with the failure.
+  [[nodiscard]] result<operation> begin_goal(std::string_view robot, std::string_view action,
+                                             std::string_view arguments, std::uint64_t tag,
+                                             limit within = unlimited,
+                                             const fipa::lock* guard = nullptr) const {
+    fipa_handle begun = 0;
+    const auto code = fipa_begin_goal(raw(), detail::text(robot), detail::text(action),
+                                      detail::text(arguments), detail::guard(guard),
+                                      within.milliseconds(), tag, &begun);
+    return detail::owned<operation>(code, begun);
+  }
+
   /// Publishes a topic.
   [[nodiscard]] result<fipa::publisher> publisher(const fipa::topic& topic) const {
     auto described = detail::sized<fipa_topic>();
@@ -1138,11 +1252,30 @@ enum class event : std::int32_t {
   notification = FIPA_EVENT_NOTIFICATION,
   /// A lock is held: `item::take_lock`.
   lock = FIPA_EVENT_LOCK,
-  /// The initiator of a task cancels it, or is gone if `item::error` says so: `item::task_id`.
+  /// The initiator of a task cancels it, or is gone if `item::error` says so: `item::refers_to`.
   cancel = FIPA_EVENT_CANCEL,
   /// A subscription is interrupted for the reason in `item::error`, and goes on when the publisher
   /// returns.
   interrupted = FIPA_EVENT_INTERRUPTED,
+  /// The answers to a call for proposals: `item::take_bids`. `item::number` is that of the
+  /// proposals.
+  bids = FIPA_EVENT_BIDS,
+  /// The result of an accepted proposal: `item::take_letter`, or none and the failure.
+  /// `item::number` is the index of the proposal.
+  awarded = FIPA_EVENT_AWARDED,
+  /// The initiator has decided on the proposal of a task, which is `item::refers_to`.
+  /// `item::number` is 1 if it has accepted.
+  decision = FIPA_EVENT_DECISION,
+  /// A goal of an action that this agent offers: `item::take_goal`.
+  goal = FIPA_EVENT_GOAL,
+  /// A goal, which is `item::refers_to`, is to stop for the reason in `item::error`.
+  stop = FIPA_EVENT_STOP,
+  /// A robot has accepted a goal.
+  accepted = FIPA_EVENT_ACCEPTED,
+  /// The progress of a goal: `item::take_json`.
+  progress = FIPA_EVENT_PROGRESS,
+  /// The result of a goal or of a question: `item::take_json`.
+  result = FIPA_EVENT_RESULT,
 };
 
 /// An item of the queue of a domain. What is not taken out of it is closed with it.
@@ -1152,12 +1285,33 @@ class item {
   explicit item(const fipa_item& raw)
       : tag_(raw.tag), number_(raw.number), kind_(static_cast<event>(raw.kind)) {
     if (raw.result != FIPA_RESULT_OK) error_ = detail::last(raw.result);
-    // The handle of a cancelled task was given out with the task.
-    if (kind_ == event::cancel) {
-      number_ = raw.handle;
-    } else {
-      // The class of the handle follows when it is taken.
-      owner_ = json::adopt(raw.handle);
+    switch (kind_) {
+      case event::outcomes:
+      case event::letter:
+      case event::change:
+      case event::answer:
+      case event::task:
+      case event::notification:
+      case event::lock:
+      case event::bids:
+      case event::awarded:
+      case event::goal:
+      case event::progress:
+      case event::result:
+        // The class of the handle follows when it is taken.
+        owner_ = json::adopt(raw.handle);
+        break;
+      case event::cancel:
+      case event::decision:
+      case event::stop:
+        // The handle was given out before, with the task or the goal.
+        refers_to_ = raw.handle;
+        break;
+      case event::ended:
+      case event::agreed:
+      case event::interrupted:
+      case event::accepted:
+        break;
     }
   }
 
@@ -1169,29 +1323,31 @@ class item {
   [[nodiscard]] bool succeeded() const noexcept { return error_.code() == errc::ok; }
   /// Returns the failure of the operation; its code is `errc::ok` if there is none.
   [[nodiscard]] const fipa::error& error() const& noexcept { return error_; }
-  /// Returns the number of notifications that were missed just before a notification.
-  [[nodiscard]] std::uint64_t missed() const noexcept {
-    return kind_ == event::notification ? number_ : 0;
-  }
-  /// Returns the `task::id` of a cancelled task, else 0.
-  [[nodiscard]] std::uint64_t task_id() const noexcept {
-    return kind_ == event::cancel ? number_ : 0;
-  }
+  /// Returns the number of the item: see `event`. For a notification, the number of those that were
+  /// missed just before.
+  [[nodiscard]] std::uint64_t number() const noexcept { return number_; }
+  /// Returns the `task::id` or `goal::id` that the item is about; 0 for other kinds.
+  [[nodiscard]] std::uint64_t refers_to() const noexcept { return refers_to_; }
 
-  /// Takes the letter, the answer or the notification out.
+  /// Takes the letter, the answer, the notification or the result of a proposal out.
   [[nodiscard]] result<letter> take_letter() {
     return take<letter>(kind_ == event::letter || kind_ == event::answer ||
-                        kind_ == event::notification);
+                        kind_ == event::notification || kind_ == event::awarded);
   }
   /// Takes the task out.
   [[nodiscard]] result<task> take_task() { return take<task>(kind_ == event::task); }
   /// Takes the lock out.
   [[nodiscard]] result<lock> take_lock() { return take<lock>(kind_ == event::lock); }
+  /// Takes the answers to a call for proposals out.
+  [[nodiscard]] result<bids> take_bids() { return take<bids>(kind_ == event::bids); }
+  /// Takes the goal out.
+  [[nodiscard]] result<goal> take_goal() { return take<goal>(kind_ == event::goal); }
   /// Takes the handle out, for the C interface. The caller closes it. Zero if there is none.
   [[nodiscard]] fipa_handle release() noexcept { return owner_.release(); }
-  /// Takes the outcomes or the change out.
+  /// Takes the outcomes, the change, the progress or the result out.
   [[nodiscard]] result<json> take_json() {
-    return take<json>(kind_ == event::outcomes || kind_ == event::change);
+    return take<json>(kind_ == event::outcomes || kind_ == event::change ||
+                      kind_ == event::progress || kind_ == event::result);
   }
 
  private:
@@ -1205,6 +1361,7 @@ class item {
 
   std::uint64_t tag_;
   std::uint64_t number_;
+  std::uint64_t refers_to_ = 0;
   event kind_;
   fipa::error error_;
   json owner_;
@@ -1317,8 +1474,7 @@ inline raw_message::raw_message(const message& from) : to_(from.to), reply_to_(f
   }
   it.parameters = parameters_.data();
   it.parameter_count = parameters_.size();
-  // The handle of a lock that is empty is no handle: the call must not send without the fence.
-  if (from.guard != nullptr) it.lock = *from.guard ? from.guard->raw() : ~fipa_handle{0};
+  it.lock = guard(from.guard);
 }
 
 }  // namespace detail
