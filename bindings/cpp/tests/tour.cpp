@@ -214,6 +214,17 @@ static void letters(const fipa::agent& rover, const fipa::agent& arm) {
   CHECK(answer->message().in_reply_to() == "r1" && !answer->message().reply_by());
   CHECK(!take(rover.receive(fipa::at_once)) && !take(rover.receive(1ms)));
 
+  // More names than fit into the message itself.
+  const std::vector<std::string> many{"a", "b", "c", "d", "e", "f"};
+  fipa::message wide{"inform", "arm"};
+  wide.reply_to = many;
+  CHECK(rover.send(wide));
+  const auto wide_letter = take(arm.receive(step));
+  CHECK(wide_letter && wide_letter->message().reply_to_count() == many.size());
+  for (std::size_t i = 0; i < many.size(); i++) {
+    CHECK(wide_letter->message().reply_to(i) == many[i]);
+  }
+
   // An empty letter reads as an empty message.
   const fipa::letter none;
   CHECK(none.content().empty() && none.message().performative().empty() && none.via().empty());
