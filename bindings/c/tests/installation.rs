@@ -31,7 +31,7 @@ fn install(build: &Path, prefix: &Path) {
             .arg(build)
             .arg(define("CMAKE_INSTALL_PREFIX", prefix))
             .arg("-DCMAKE_INSTALL_LIBDIR=lib")
-            .arg(define("FIPA_LIBRARY_DIR", library())),
+            .arg(define("FIPA_LIBRARY_DIR", &library())),
     );
     tool(Command::new("cmake").arg("--install").arg(build));
 }

@@ -342,6 +342,27 @@ struct parameter {
 
 class agent;
 class lock;
+class member;
+
+/// What gives the fences of a message: a lock, or the membership of a leader. It owns nothing.
+class guard {
+ public:
+  /// Without fences.
+  constexpr guard() noexcept = default;
+  /// The fences of a lock.
+  guard(const lock& held) noexcept;
+  /// The fence of the leader of a coalition.
+  guard(const member& leader) noexcept;
+
+  /// Returns the handle for the C interface.
+  [[nodiscard]] constexpr fipa_handle raw() const noexcept { return raw_; }
+
+ private:
+  // An empty object gives a handle that does not exist, so that no call sends without the fence.
+  explicit guard(fipa_handle raw) noexcept : raw_(raw == 0 ? ~fipa_handle{0} : raw) {}
+
+  fipa_handle raw_ = 0;
+};
 
 /// A message to be sent. It owns nothing: what its fields refer to must last until the call has
 /// returned. A field that is not set is not part of the message.
@@ -374,8 +395,8 @@ struct message {
   const parameter* parameters = nullptr;
   /// Number of the user-defined parameters.
   std::size_t parameter_count = 0;
-  /// The lock whose fences the message carries.
-  const lock* guard = nullptr;
+  /// The lock or the membership whose fences the message carries.
+  fipa::guard guard{};
 };
 
 namespace detail {
@@ -886,16 +907,38 @@ class lock : public detail::handle<lock> {
   result<lock_state> state() const&& = delete;
 };
 
-namespace detail {
+/// The membership of an agent in a coalition, until the object is destroyed. The items are
+/// `event::change`.
+class member : public detail::handle<member> {
+ public:
+  /// Without a membership.
+  member() noexcept {}
 
-/// The handle of a lock that a message carries. A lock that is empty gives no handle that exists:
-/// the call must not send without the fence.
-inline fipa_handle guard(const lock* held) noexcept {
-  if (held == nullptr) return 0;
-  return *held ? held->raw() : ~fipa_handle{0};
-}
+  /// Gives up the lead, if the agent leads.
+  result<void> resign() const { return detail::checked(fipa_resign(raw())); }
+  /// Checks the fence of a command of a leader. If the error is `errc::stale`, it must not be acted
+  /// on.
+  template <class Owner>
+  result<void> check(const detail::readable<Owner>& letter) const {
+    return detail::checked(fipa_check_fence(raw(), letter.raw()));
+  }
+};
 
-}  // namespace detail
+/// A coalition that an agent has founded. It is dissolved when the object is destroyed.
+class coalition : public detail::handle<coalition> {
+ public:
+  /// Without a coalition.
+  coalition() noexcept {}
+
+  /// Replaces the members.
+  result<void> change(const texts& members) const {
+    const detail::text_array names(members);
+    return detail::checked(fipa_change_coalition(raw(), names.data(), names.size()));
+  }
+};
+
+inline guard::guard(const lock& held) noexcept : guard(held.raw()) {}
+inline guard::guard(const member& leader) noexcept : guard(leader.raw()) {}
 
 /// A resource that an agent owns until the object is destroyed.
 class owned_resource : public detail::handle<owned_resource> {
@@ -1043,6 +1086,19 @@ struct own_options {
   bool forget = false;
 };
 
+namespace detail {
+
+inline fipa_own_options raw(const own_options& options) noexcept {
+  auto chosen = sized<fipa_own_options>();
+  chosen.lease_ms = static_cast<std::int64_t>(options.lease.count());
+  chosen.state_dir = text(options.state_dir);
+  chosen.is_volatile = options.is_volatile ? 1 : 0;
+  chosen.forget = options.forget ? 1 : 0;
+  return chosen;
+}
+
+}  // namespace detail
+
 /// The description of an agent in the directory.
 struct agent_options {
   /// The kind of agent, for searches.
@@ -1169,10 +1225,10 @@ class agent : public detail::handle<agent> {
   [[nodiscard]] result<operation> begin_goal(std::string_view robot, std::string_view action,
                                              std::string_view arguments, std::uint64_t tag,
                                              limit within = unlimited,
-                                             const fipa::lock* guard = nullptr) const {
+                                             fipa::guard guard = {}) const {
     fipa_handle begun = 0;
     const auto code = fipa_begin_goal(raw(), detail::text(robot), detail::text(action),
-                                      detail::text(arguments), detail::guard(guard),
+                                      detail::text(arguments), guard.raw(),
                                       within.milliseconds(), tag, &begun);
     return detail::owned<operation>(code, begun);
   }
@@ -1218,14 +1274,26 @@ class agent : public detail::handle<agent> {
         fipa_begin_lock(raw(), names.data(), names.size(), within.milliseconds(), tag, &begun);
     return detail::owned<operation>(code, begun);
   }
+  /// Founds a coalition: one name for these agents. `options` is as for `own`.
+  [[nodiscard]] result<coalition> found_coalition(std::string_view name, const texts& members,
+                                                  const own_options& options = {}) const {
+    const detail::text_array names(members);
+    const auto chosen = detail::raw(options);
+    fipa_handle made = 0;
+    const auto code = fipa_found_coalition(raw(), detail::text(name), names.data(), names.size(),
+                                           &chosen, &made);
+    return detail::owned<coalition>(code, made);
+  }
+  /// Takes part in a coalition, which may be founded later. The items are `event::change`.
+  [[nodiscard]] result<member> join_coalition(std::string_view name, std::uint64_t tag) const {
+    fipa_handle made = 0;
+    const auto code = fipa_join_coalition(raw(), detail::text(name), tag, &made);
+    return detail::owned<member>(code, made);
+  }
   /// Owns a resource, whose locks other agents then request.
   [[nodiscard]] result<owned_resource> own(std::string_view resource,
                                            const own_options& options = {}) const {
-    auto chosen = detail::sized<fipa_own_options>();
-    chosen.lease_ms = static_cast<std::int64_t>(options.lease.count());
-    chosen.state_dir = detail::text(options.state_dir);
-    chosen.is_volatile = options.is_volatile ? 1 : 0;
-    chosen.forget = options.forget ? 1 : 0;
+    const auto chosen = detail::raw(options);
     fipa_handle made = 0;
     const auto code = fipa_own(raw(), detail::text(resource), &chosen, &made);
     return detail::owned<owned_resource>(code, made);
@@ -1240,7 +1308,7 @@ enum class event : std::int32_t {
   outcomes = FIPA_EVENT_OUTCOMES,
   /// A letter has arrived: `item::take_letter`.
   letter = FIPA_EVENT_LETTER,
-  /// The directory has changed: `item::take_json`.
+  /// The directory or a coalition has changed: `item::take_json`.
   change = FIPA_EVENT_CHANGE,
   /// The other agent has agreed to a request.
   agreed = FIPA_EVENT_AGREED,
@@ -1376,6 +1444,36 @@ struct domain_options {
   texts set{};
 };
 
+namespace detail {
+
+inline fipa_domain_options raw(const domain_options& options, const text_array& set) noexcept {
+  auto chosen = sized<fipa_domain_options>();
+  chosen.config = text(options.config);
+  chosen.set = set.data();
+  chosen.set_count = set.size();
+  return chosen;
+}
+
+}  // namespace detail
+
+#if defined(FIPA_GATEWAY)
+/// The gateway of this host in the process, as `fipa up` runs it, until the object is destroyed.
+class gateway : public detail::handle<gateway> {
+ public:
+  /// Without a gateway.
+  gateway() noexcept {}
+
+  /// Runs the gateway. Only in a library with the feature `gateway`.
+  [[nodiscard]] static result<gateway> open(const domain_options& options = {}) {
+    const detail::text_array set(options.set);
+    const auto chosen = detail::raw(options, set);
+    fipa_handle opened = 0;
+    const auto code = fipa_open_gateway(&chosen, &opened);
+    return detail::owned<gateway>(code, opened);
+  }
+};
+#endif
+
 /// The membership of this process in a domain, which it leaves when the object is destroyed.
 class domain : public detail::handle<domain> {
  public:
@@ -1385,10 +1483,7 @@ class domain : public detail::handle<domain> {
   /// Joins a domain.
   [[nodiscard]] static result<domain> open(const domain_options& options = {}) {
     const detail::text_array set(options.set);
-    auto chosen = detail::sized<fipa_domain_options>();
-    chosen.config = detail::text(options.config);
-    chosen.set = set.data();
-    chosen.set_count = set.size();
+    const auto chosen = detail::raw(options, set);
     fipa_handle opened = 0;
     const auto code = fipa_open(&chosen, &opened);
     return detail::owned<domain>(code, opened);
@@ -1474,7 +1569,7 @@ inline raw_message::raw_message(const message& from) : to_(from.to), reply_to_(f
   }
   it.parameters = parameters_.data();
   it.parameter_count = parameters_.size();
-  it.lock = guard(from.guard);
+  it.lock = from.guard.raw();
 }
 
 }  // namespace detail

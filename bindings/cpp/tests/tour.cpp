@@ -28,7 +28,8 @@ static_assert(is_move_only<fipa::domain> && is_move_only<fipa::agent> &&
               is_move_only<fipa::operation> && is_move_only<fipa::lock> &&
               is_move_only<fipa::owned_resource> && is_move_only<fipa::publisher> &&
               is_move_only<fipa::notification_loan> && is_move_only<fipa::json> &&
-              is_move_only<fipa::bids> && is_move_only<fipa::offer> && is_move_only<fipa::goal>);
+              is_move_only<fipa::bids> && is_move_only<fipa::offer> && is_move_only<fipa::goal> &&
+              is_move_only<fipa::coalition> && is_move_only<fipa::member>);
 static_assert(!std::is_copy_constructible_v<fipa::item>);
 // A handle is no number, and a handle of one class is none of another.
 static_assert(!std::is_convertible_v<fipa::agent, bool>);
@@ -480,7 +481,7 @@ static void actions(const fipa::domain& domain, const fipa::agent& rover, const 
   }
   CHECK(rover.begin_goal("arm", "navigate", "[1]", 72).error().code() == errc::invalid);
   const fipa::lock none;
-  const auto unguarded = rover.begin_goal("arm", "navigate", {}, 72, step, &none);
+  const auto unguarded = rover.begin_goal("arm", "navigate", {}, 72, step, none);
   CHECK(unguarded.error().code() == errc::bad_handle);
 
   auto going = take(rover.begin_goal("arm", "navigate", "{\"x\": 1.5}", 73, step));
@@ -555,7 +556,7 @@ static void locks(const fipa::domain& domain, const fipa::agent& rover, const fi
   CHECK(state.is_held && state.remaining && *state.remaining > 0ms && !state.fence.empty());
 
   fipa::message command{"inform", "arm", "open"};
-  command.guard = &lock;
+  command.guard = lock;
   CHECK(rover.send(command));
   // Letters of the conversations before may come first.
   auto letter = take(arm.receive(step));
@@ -574,6 +575,56 @@ static void locks(const fipa::domain& domain, const fipa::agent& rover, const fi
   CHECK(next(domain, 40, event::ended).error().code() == errc::closed);
   CHECK(next_lock.state().error().code() == errc::bad_handle);
 }
+
+static void coalitions(const fipa::domain& domain, const fipa::agent& rover,
+                       const fipa::agent& arm, const std::string_view state_dir) {
+  const std::array<std::string_view, 2> both{"rover", "arm"};
+  fipa::own_options options;
+  options.state_dir = state_dir;
+  options.forget = true;
+  CHECK(!arm.found_coalition("team", {}, options));
+  const auto founded = take(arm.found_coalition("team", both, options));
+  const fipa::agent* agents[] = {&rover, &arm};
+  fipa::member members[] = {take(rover.join_coalition("team", 0)),
+                            take(arm.join_coalition("team", 1))};
+  std::optional<std::size_t> leader;
+  while (!leader) {
+    auto item = take(domain.next(step));
+    CHECK(item && item->kind() == event::change);
+    const auto change = take(item->take_json());
+    if (has(change.view(), "\"leads\":true")) leader = item->tag();
+  }
+  const std::size_t follower = 1 - *leader;
+
+  fipa::message command{"inform", both[follower], "turn"};
+  command.guard = members[*leader];
+  CHECK(agents[*leader]->send(command));
+  auto letter = take(agents[follower]->receive(step));
+  while (letter && letter->content().text() != "turn") {
+    letter = take(agents[follower]->receive(step));
+  }
+  CHECK(letter && members[follower].check(*letter));
+  command.to = both[*leader];
+  command.guard = members[follower];
+  CHECK(agents[follower]->send(command).error().code() == errc::lost);
+  command.guard = fipa::member();
+  CHECK(agents[follower]->send(command).error().code() == errc::bad_handle);
+
+  CHECK(founded.change("rover") && members[*leader].resign());
+  CHECK(fipa::coalition().change("rover").error().code() == errc::bad_handle);
+  for (fipa::member& member : members) CHECK(member.close());
+  while (take(domain.next(fipa::at_once))) {
+  }
+}
+
+#if defined(FIPA_GATEWAY)
+static void gateways(const std::string_view config) {
+  const std::array<std::string_view, 1> set{"discovery.mdns=false"};
+  auto gateway = take(fipa::gateway::open({config, set}));
+  CHECK(has(fipa::gateway::open({config, set}).error().text(), "already running"));
+  CHECK(gateway.close());
+}
+#endif
 
 int main(int argc, char** argv) {
   CHECK(argc == 3 && fipa::version() == VERSION);
@@ -594,6 +645,10 @@ int main(int argc, char** argv) {
   actions(domain, rover, arm);
   topics(domain, rover, arm);
   locks(domain, rover, arm, argv[2]);
+  coalitions(domain, rover, arm, argv[2]);
+#if defined(FIPA_GATEWAY)
+  gateways(argv[1]);
+#endif
 
   // The end of an agent ends what waits for it.
   const auto listening = take(arm.listen(50));

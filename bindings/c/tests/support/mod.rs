@@ -6,22 +6,6 @@ use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::LazyLock;
-
-/// The directory with the library, which is built first.
-static LIBRARY: LazyLock<PathBuf> = LazyLock::new(|| {
-    let built = Command::new(env!("CARGO"))
-        .args(["build", "--locked", "--quiet", "-p", "fipa-c"])
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .status();
-    assert!(built.expect("cargo runs").success());
-    let test = env::current_exe().expect("the test has a path");
-    let profile = test
-        .ancestors()
-        .nth(2)
-        .expect("the test is in target/debug/deps");
-    profile.to_owned()
-});
 
 pub(crate) const SHARED: &[&str] = &["-lfipa_c"];
 pub(crate) const STATIC: &[&str] = &["-l:libfipa_c.a", "-lpthread", "-ldl", "-lm"];
@@ -37,9 +21,11 @@ pub(crate) const C: &[&str] = &[
     "-g",
 ];
 
-/// Returns the directory with the library.
-pub(crate) fn library() -> &'static Path {
-    &LIBRARY
+/// Returns the directory with the libraries that cargo has built for this test.
+pub(crate) fn library() -> PathBuf {
+    let test = env::current_exe().expect("the test has a path");
+    let parent = test.parent().expect("the test is in target/debug/deps");
+    parent.to_owned()
 }
 
 /// Returns the path of a file or a folder in `bindings`.
@@ -88,6 +74,7 @@ impl Workshop {
         let compiled = Command::new(compiler)
             .args(flags)
             .arg(format!("-DVERSION=\"{}\"", env!("CARGO_PKG_VERSION")))
+            .args(cfg!(feature = "gateway").then_some("-DFIPA_GATEWAY"))
             .arg("-I")
             .arg(bindings("c/include"))
             .arg("-I")
