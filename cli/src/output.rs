@@ -239,7 +239,7 @@ pub(crate) fn visible_in_json(document: &str) -> Cow<'_, str> {
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
+    use serde_json::{Value, json};
 
     use super::*;
 
