@@ -463,7 +463,8 @@ typedef struct fipa_item {
    */
   fipa_result result;
   /*
-   The handle, which the caller closes; zero if there is none.
+   The handle, which the caller closes unless the kind says that it is that of a task or goal; zero if there is
+   none.
    */
   fipa_handle handle;
   /*

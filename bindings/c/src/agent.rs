@@ -111,6 +111,14 @@ fn send_loan(agent: &Agent, loan: Loan, within: Option<Duration>) -> Sending {
     }
 }
 
+/// Checks the pointer to the outcomes before a letter is sent.
+fn checked(outcomes: *mut FipaHandle) -> Result<(), Failure> {
+    match outcomes.is_null() {
+        true => Ok(()),
+        false => writable(outcomes, "the outcomes"),
+    }
+}
+
 /// Waits for the outcomes, and writes them for the caller.
 ///
 /// # Safety
@@ -155,6 +163,7 @@ pub unsafe extern "C" fn fipa_send(
     outcomes: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
+        checked(outcomes)?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let draft = unsafe { Draft::read(message) }?;
@@ -201,6 +210,7 @@ pub unsafe extern "C" fn fipa_answer(
     outcomes: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
+        checked(outcomes)?;
         let own = table::get::<OwnAgent>(agent)?;
         let letter = LetterRef::of(letter)?;
         // SAFETY: The caller promises it.
@@ -275,6 +285,7 @@ pub unsafe extern "C" fn fipa_send_loan(
     outcomes: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
+        checked(outcomes)?;
         let open = table::get::<OpenLoan>(loan)?;
         let taken = open.take()?;
         drop(table::remove(loan));

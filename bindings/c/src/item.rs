@@ -82,7 +82,8 @@ pub struct FipaItem {
     pub kind: FipaEvent,
     /// Zero, or the failure of the operation. `fipa_error` has its text until the next failure of this thread.
     pub result: FipaResult,
-    /// The handle, which the caller closes; zero if there is none.
+    /// The handle, which the caller closes unless the kind says that it is that of a task or goal; zero if there is
+    /// none.
     pub handle: FipaHandle,
     /// A number that depends on the kind.
     pub number: u64,

@@ -48,6 +48,8 @@ static void wrong_pointers(fipa_handle domain, fipa_handle agent) {
   sent = message("inform", &to, NULL);
   sent.lock = agent;
   BAD(fipa_send(agent, &sent, -1, NULL));
+  sent = message("inform", &to, NULL);
+  REFUSED(fipa_send(agent, &sent, -1, (fipa_handle *)((char *)&handle + 1)));
   REFUSED(fipa_next(domain, 0, NULL));
   memset(&item, 0, sizeof item);
   REFUSED(fipa_next(domain, 0, &item));
