@@ -217,6 +217,7 @@ impl Request {
     /// # Errors
     /// If the other side refuses, fails, is gone, or does not answer in time, or if the request was
     /// cancelled ([`DialogueError::Cancelled`]). Dropping the future loses no message, and the next call waits on.
+    /// The conversation stays with the request until it is dropped.
     pub async fn result(&mut self) -> Result<Message, DialogueError> {
         loop {
             if let Some(end) = &self.end {

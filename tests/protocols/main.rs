@@ -177,6 +177,7 @@ async fn missing_and_invalid_answers_are_errors() {
         request.result().await,
         Err(DialogueError::TimedOut)
     ));
+    drop(request);
     let first = next_message(&arm).await.unwrap().into_message();
     // No call leads the conversation, so its message goes to `receive`.
     let late = arm.reply(&first, Performative::Agree).build().unwrap();

@@ -389,7 +389,7 @@ typedef struct fipa_message {
    The handle of a lock, or of the membership in a coalition that the agent leads. The message then carries its
    fences. Zero in messages that are read.
    */
-  fipa_handle lock;
+  uint64_t lock;
 } fipa_message;
 
 /*
@@ -915,24 +915,6 @@ fipa_result fipa_follow_agents(fipa_handle domain,
                                uint64_t tag,
                                fipa_handle *operation);
 
-/*
- Returns the text of a handle: of a JSON text, of the answers to a call for proposals, or of the arguments of a goal.
- It is valid until the handle is closed.
-
- # Safety
- `text` is NULL or can be written.
- */
-fipa_result fipa_read_text(fipa_handle handle,
-                           struct fipa_text *text);
-
-/*
- Closes a handle of any kind. What was read from it is no longer valid.
-
- A domain is left, and letters in transit get one second; an agent is deregistered; a lock is released; a task that
- has no answer fails; an operation ends, without a further item; an open loan is dropped.
- */
-fipa_result fipa_close(fipa_handle handle);
-
 #if defined(FIPA_GATEWAY)
 /*
  Runs the gateway of this host in the process, as `fipa up` does, with the configuration of `options` or, if that is
@@ -972,6 +954,24 @@ fipa_result fipa_fd(fipa_handle domain,
  `FIPA_RESULT_CANCELLED`, or with its result if the other side goes on.
  */
 fipa_result fipa_cancel(fipa_handle operation);
+
+/*
+ Returns the text of a handle: of a JSON text, of the answers to a call for proposals, or of the arguments of a goal.
+ It is valid until the handle is closed.
+
+ # Safety
+ `text` is NULL or can be written.
+ */
+fipa_result fipa_read_text(fipa_handle handle,
+                           struct fipa_text *text);
+
+/*
+ Closes a handle of any kind. What was read from it is no longer valid.
+
+ A domain is left, and letters in transit get one second; an agent is deregistered; a lock is released; a task that
+ has no answer fails; an operation ends, without a further item; an open loan is dropped.
+ */
+fipa_result fipa_close(fipa_handle handle);
 
 /*
  Locks resources, all of them or none; waits up to `timeout_ms`, or without a limit if it is negative. The agent

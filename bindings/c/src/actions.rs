@@ -15,12 +15,11 @@ use serde_json::{Map, Value, json};
 use tokio::sync::{Notify, mpsc, oneshot};
 
 use crate::agent::OwnAgent;
-use crate::domain::Text;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, GivenHandle, OperationHandle, script};
+use crate::item::{Event, FipaEvent, GivenHandle, OperationHandle, Text, script};
 use crate::locks::HeldLock;
 use crate::raw::{FipaText, limit, put, writable};
-use crate::table::{self, FipaHandle};
+use crate::table::{self, FipaHandle, Object};
 
 /// Time for the answer to a cancel.
 const CANCEL: Duration = Duration::from_secs(10);
@@ -28,28 +27,28 @@ const CANCEL: Duration = Duration::from_secs(10);
 type Arguments = Map<String, Value>;
 
 /// A goal of an action that this agent offers.
-pub(crate) struct OpenGoal {
-    pub(crate) handle: GivenHandle,
+struct OpenGoal {
     arguments: Text,
     execution: Arc<Execution>,
     end: Mutex<Option<oneshot::Sender<Result<Term<'static>, String>>>>,
 }
 
-impl OpenGoal {
-    pub(crate) fn arguments(&self) -> &Text {
-        &self.arguments
+impl Object for OpenGoal {
+    fn text(&self) -> Option<&str> {
+        Some(self.arguments.as_str())
     }
 }
 
 /// An offered action.
-pub(crate) struct OpenOffer {
+struct OpenOffer {
     _offer: Offer,
     operation: OperationHandle,
 }
 
-impl OpenOffer {
-    pub(crate) fn end(&self) {
+impl Object for OpenOffer {
+    fn close(&self) -> Result<(), Failure> {
         self.operation.end();
+        Ok(())
     }
 }
 
@@ -87,7 +86,7 @@ pub unsafe extern "C" fn fipa_offer(
             operation: OperationHandle::of(own.items.follow(tag, goals)),
         };
         // SAFETY: The caller promises it.
-        unsafe { put(offer, table::add(open), "the handle") }?;
+        unsafe { put(offer, table::add(Arc::new(open)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -125,13 +124,13 @@ async fn pursue(
     let handle = GivenHandle::default();
     let arguments = Text::json(&arguments).map_err(|failure| failure.text)?;
     let goal = OpenGoal {
-        handle: Arc::clone(&handle),
         arguments,
         execution: Arc::clone(&execution),
         end: Mutex::new(Some(end)),
     };
     let withdrawn = "the program has ended its offer";
-    events.send(Event::Goal(goal)).map_err(|_| withdrawn)?;
+    let event = Event::giving(FipaEvent::Goal, goal, &handle);
+    events.send(event).map_err(|_| withdrawn)?;
     let mut is_stopped = false;
     loop {
         tokio::select! {
@@ -142,7 +141,8 @@ async fn pursue(
                 is_stopped = true;
                 let (code, text) = stop(cause);
                 // The program may have ended its offer; it still can end the goal.
-                let _ = events.send(Event::Stop(Arc::clone(&handle), Failure::new(code, text)));
+                let stop = Event::about(FipaEvent::Stop, &handle);
+                let _ = events.send(stop.result(Err(Failure::new(code, text))));
             }
         }
     }
@@ -243,12 +243,13 @@ pub unsafe extern "C" fn fipa_begin_actions(
         let agent = own.agent.clone();
         let events = script(async move |emitter| {
             let actions = agent.robot(robot).actions().await.or_fail()?;
-            emitter.emit(Event::Result(Text::json(&actions)?)).await;
+            let actions = Text::json(&actions)?;
+            emitter.emit(Event::with(FipaEvent::Result, actions)).await;
             Ok(())
         });
         let began = OperationHandle::of(own.items.follow(tag, events));
         // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(began), "the handle") }?;
+        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -299,7 +300,7 @@ pub unsafe extern "C" fn fipa_begin_goal(
         let events = script(async move |emitter| {
             let robot = agent.robot(robot);
             let mut running = robot.send(goal).await.or_fail()?;
-            emitter.emit(Event::Accepted).await;
+            emitter.emit(Event::of(FipaEvent::Accepted)).await;
             // A goal that has ended already has no progress.
             let mut updates = running.progress().await.ok();
             let result = loop {
@@ -307,7 +308,10 @@ pub unsafe extern "C" fn fipa_begin_goal(
                     biased;
                     status = async { updates.as_mut()?.next().await.ok().flatten() }, if updates.is_some() => {
                         match status {
-                            Some(status) => emitter.emit(Event::Progress(progress(&status)?)).await,
+                            Some(status) => {
+                                let progress = progress(&status)?;
+                                emitter.emit(Event::with(FipaEvent::Progress, progress)).await;
+                            }
                             None => updates = None,
                         }
                     }
@@ -321,12 +325,13 @@ pub unsafe extern "C" fn fipa_begin_goal(
                 Some(term) => json_of(&term)?,
                 None => Value::Null,
             };
-            emitter.emit(Event::Result(Text::json(&value)?)).await;
+            let value = Text::json(&value)?;
+            emitter.emit(Event::with(FipaEvent::Result, value)).await;
             Ok(())
         });
         let began = OperationHandle::cancellable(own.items.follow(tag, events), cancel);
         // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(began), "the handle") }?;
+        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }

@@ -1,19 +1,21 @@
 //! Agents: registering, sending, loans, receiving.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use fipa::blocking::Wait;
-use fipa::error::SendError;
+use fipa::error::{DeregisterError, SendError};
 use fipa::{Agent, Deliveries, Incoming, Loan, MessageBuilder, RegisterOptions};
 use futures_util::stream::unfold;
 use parking_lot::Mutex;
 
-use crate::domain::{Membership, Text};
+use crate::domain::Membership;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, Items, OperationHandle, failed, outcome};
-use crate::message::{Draft, FipaMessage, Letter, LetterRef};
+use crate::item::{Event, FipaEvent, Items, OperationHandle, Text};
+use crate::letter::{FipaMessage, Letter};
+use crate::message::Draft;
 use crate::raw::{Extensible, FipaText, Readable, limit, put, structure, writable};
-use crate::table::{self, FipaHandle};
+use crate::table::{self, FipaHandle, Object};
 
 /// Length of a content in bytes from which it is copied into memory that the receivers read in place.
 const IN_PLACE: usize = 4_096;
@@ -39,6 +41,17 @@ unsafe impl Readable for FipaAgentOptions {}
 pub(crate) struct OwnAgent {
     pub(crate) agent: Agent,
     pub(crate) items: Items,
+}
+
+impl Object for OwnAgent {
+    fn close(&self) -> Result<(), Failure> {
+        // Operations hold further handles of the agent.
+        match self.agent.clone().deregister() {
+            // The domain was closed before, which has deregistered the agent.
+            Ok(_) | Err(DeregisterError::Closed) => Ok(()),
+            Err(error) => Err(Failure::of(error)),
+        }
+    }
 }
 
 /// Registers an agent. `options` may be NULL. `fipa_close` deregisters it, and what it has not received is dropped.
@@ -74,7 +87,7 @@ pub unsafe extern "C" fn fipa_register(
             items: membership.items.clone(),
         };
         // SAFETY: The caller promises it.
-        unsafe { put(agent, table::add(own), "the handle") }?;
+        unsafe { put(agent, table::add(Arc::new(own)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -130,19 +143,30 @@ unsafe fn settle(sending: Sending, outcomes: *mut FipaHandle) -> Result<FipaResu
         unsafe {
             put(
                 outcomes,
-                table::add(Text::json(&deliveries)?),
+                table::add(Arc::new(Text::json(&deliveries)?)),
                 "the outcomes",
             )
         }?;
     }
-    Ok(outcome(&deliveries))
+    all_delivered(&deliveries).map(|()| FipaResult::Ok)
+}
+
+/// A failure that lists the outcomes, unless each receiver has got the letter.
+fn all_delivered(outcomes: &Deliveries) -> Result<(), Failure> {
+    match outcomes.all_succeeded() {
+        true => Ok(()),
+        false => Err(Failure::new(FipaResult::NotDelivered, outcomes.to_string())),
+    }
 }
 
 /// An operation that ends with the outcomes.
 async fn outcomes_of(sending: Sending) -> Event {
     match sending.await {
-        Ok(outcomes) => Event::Outcomes(outcomes),
-        Err(error) => failed(Failure::of(error)),
+        Ok(outcomes) => match Text::json(&outcomes) {
+            Ok(text) => Event::with(FipaEvent::Outcomes, text).result(all_delivered(&outcomes)),
+            Err(failure) => Event::ended(Err(failure)),
+        },
+        Err(error) => Event::ended(Err(Failure::of(error))),
     }
 }
 
@@ -212,12 +236,13 @@ pub unsafe extern "C" fn fipa_answer(
     call(|| {
         checked(outcomes)?;
         let own = table::get::<OwnAgent>(agent)?;
-        let letter = LetterRef::of(letter)?;
+        let object = table::any(letter)?;
+        let letter = object
+            .letter()
+            .ok_or_else(|| table::other_kind(letter, "Letter"))?;
         // SAFETY: The caller promises it.
         let draft = unsafe { Draft::read(message) }?;
-        let builder = own
-            .agent
-            .reply(letter.get()?.message(), draft.performative(None)?);
+        let builder = own.agent.reply(letter.message(), draft.performative(None)?);
         let sending = send(&own.agent, &draft, builder, limit(timeout_ms))?;
         // SAFETY: The caller promises it.
         unsafe { settle(sending, outcomes) }
@@ -230,6 +255,8 @@ pub(crate) struct OpenLoan {
     items: Items,
     loan: Mutex<Option<Loan>>,
 }
+
+impl Object for OpenLoan {}
 
 impl OpenLoan {
     fn take(&self) -> Result<Loan, Failure> {
@@ -269,7 +296,7 @@ pub unsafe extern "C" fn fipa_loan(
         // SAFETY: The caller promises it.
         unsafe { put(content, memory, "the content") }?;
         // SAFETY: The caller promises it.
-        unsafe { put(loan, table::add(open), "the handle") }?;
+        unsafe { put(loan, table::add(Arc::new(open)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -336,7 +363,13 @@ pub unsafe extern "C" fn fipa_receive(
             return Ok(FipaResult::Empty);
         };
         // SAFETY: The caller promises it.
-        unsafe { put(letter, table::add(Letter::from(received)), "the handle") }?;
+        unsafe {
+            put(
+                letter,
+                table::add(Arc::new(Letter::from(received))),
+                "the handle",
+            )
+        }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -358,13 +391,16 @@ pub unsafe extern "C" fn fipa_listen(
         let letters = unfold(Some(own.agent.clone()), |agent| async move {
             let agent = agent?;
             match agent.receive().await {
-                Ok(letter) => Some((Event::Letter(letter.into()), Some(agent))),
-                Err(error) => Some((failed(Failure::of(error)), None)),
+                Ok(letter) => {
+                    let letter = Letter::from(letter);
+                    Some((Event::with(FipaEvent::Letter, letter), Some(agent)))
+                }
+                Err(error) => Some((Event::ended(Err(Failure::of(error))), None)),
             }
         });
         let began = OperationHandle::of(own.items.follow(tag, letters));
         // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(began), "the handle") }?;
+        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }

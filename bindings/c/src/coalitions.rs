@@ -1,30 +1,44 @@
 //! Coalitions with a leader: the founder and the members.
 
+use std::sync::Arc;
+
 use fipa::blocking::Wait;
 use fipa::coalitions::{CoalitionOptions, CoalitionState, LedCoalition, Membership};
+use fipa::{Message, MessageBuilder};
 use futures_util::stream::unfold;
 use serde_json::json;
 
 use crate::agent::OwnAgent;
-use crate::domain::Text;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, OperationHandle, failed};
+use crate::item::{Event, FipaEvent, OperationHandle, Text};
 use crate::locks::{FipaOwnOptions, own_options};
 use crate::raw::{FipaText, put, texts, writable};
-use crate::table::{self, FipaHandle};
+use crate::table::{self, FipaHandle, Object};
 
 /// A coalition that an agent has founded.
 struct FoundedCoalition(LedCoalition);
 
 /// The part of an agent in a coalition.
-pub(crate) struct CoalitionMember {
-    pub(crate) membership: Membership,
+struct CoalitionMember {
+    membership: Membership,
     operation: OperationHandle,
 }
 
-impl CoalitionMember {
-    pub(crate) fn end(&self) {
+impl Object for FoundedCoalition {}
+
+impl Object for CoalitionMember {
+    fn close(&self) -> Result<(), Failure> {
         self.operation.end();
+        Ok(())
+    }
+
+    fn guard(&self, message: MessageBuilder) -> Option<Result<MessageBuilder, Failure>> {
+        let guarded = self.membership.guard(message);
+        Some(guarded.map_err(|error| Failure::new(FipaResult::Lost, error.to_string())))
+    }
+
+    fn check(&self, message: &Message) -> Option<Result<(), Failure>> {
+        Some(self.membership.check(message).map(drop).or_fail())
     }
 }
 
@@ -61,7 +75,7 @@ pub unsafe extern "C" fn fipa_found_coalition(
         unsafe {
             put(
                 coalition,
-                table::add(FoundedCoalition(founded)),
+                table::add(Arc::new(FoundedCoalition(founded))),
                 "the handle",
             )
         }?;
@@ -111,8 +125,8 @@ pub unsafe extern "C" fn fipa_join_coalition(
         let membership = own.agent.join_coalition(name).or_fail()?;
         let changes = unfold(membership.changes(), |mut changes| async {
             let event = match shown(&changes.next().await?) {
-                Ok(text) => Event::Change(text),
-                Err(failure) => failed(failure),
+                Ok(text) => Event::with(FipaEvent::Change, text),
+                Err(failure) => Event::ended(Err(failure)),
             };
             Some((event, changes))
         });
@@ -121,7 +135,7 @@ pub unsafe extern "C" fn fipa_join_coalition(
             operation: OperationHandle::of(own.items.follow(tag, changes)),
         };
         // SAFETY: The caller promises it.
-        unsafe { put(member, table::add(joined), "the handle") }?;
+        unsafe { put(member, table::add(Arc::new(joined)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }

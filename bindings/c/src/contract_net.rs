@@ -1,23 +1,20 @@
 //! Calls for proposals (FIPA00029).
 
-use fipa::Performative;
+use std::sync::Arc;
+use std::time::Duration;
+
 use fipa::protocol::ContractNet;
+use fipa::{Message, Performative};
 use serde_json::json;
 use tokio::sync::Mutex;
 
 use crate::agent::OwnAgent;
-use crate::conversation::LONG;
-use crate::domain::Text;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, Items, OperationHandle, script};
-use crate::message::{Draft, FipaMessage, Letter};
-use crate::raw::{FipaBytes, elements, limit, put, writable};
-use crate::table::{self, FipaHandle};
-
-use std::sync::Arc;
-use std::time::Duration;
-
-use fipa::Message;
+use crate::item::{Event, FipaEvent, Items, OperationHandle, Text, script};
+use crate::letter::{FipaMessage, Letter};
+use crate::message::Draft;
+use crate::raw::{FipaBytes, LONG, elements, limit, put, writable};
+use crate::table::{self, FipaHandle, Object};
 
 /// Time for the proposals if the caller sets none.
 const TIMEOUT: Duration = Duration::from_secs(10);
@@ -51,13 +48,11 @@ impl OpenCall {
             items,
         })
     }
+}
 
-    pub(crate) fn proposals(&self) -> usize {
-        self.proposals.len()
-    }
-
-    pub(crate) fn answers(&self) -> &Text {
-        &self.answers
+impl Object for OpenCall {
+    fn text(&self) -> Option<&str> {
+        Some(self.answers.as_str())
     }
 }
 
@@ -89,12 +84,14 @@ pub unsafe extern "C" fn fipa_begin_call(
         let events = script(async move |emitter| {
             let net = agent.contract_net(builder, &receivers, timeout).await;
             let open = OpenCall::new(net.or_fail()?, items)?;
-            emitter.emit(Event::Bids(open)).await;
+            let number = open.proposals.len() as u64;
+            let bids = Event::with(FipaEvent::Bids, open).number(number);
+            emitter.emit(bids).await;
             Ok(())
         });
         let began = OperationHandle::of(own.items.follow(tag, events));
         // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(began), "the handle") }?;
+        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -121,7 +118,13 @@ pub unsafe extern "C" fn fipa_read_bid(
             ))
         })?;
         // SAFETY: The caller promises it.
-        unsafe { put(letter, table::add(Letter::from(proposal)), "the handle") }?;
+        unsafe {
+            put(
+                letter,
+                table::add(Arc::new(Letter::from(proposal))),
+                "the handle",
+            )
+        }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -174,10 +177,13 @@ pub unsafe extern "C" fn fipa_award(
                             .is_some_and(|sender| sender.name() == one.agent)
                     };
                     let index = calls.proposals.iter().position(from).unwrap_or_default();
-                    let result = one.result.map(Letter::from).or_fail();
-                    emitter.emit(Event::Awarded(index, result)).await;
+                    let event = match one.result {
+                        Ok(message) => Event::with(FipaEvent::Awarded, Letter::from(message)),
+                        Err(error) => Event::of(FipaEvent::Awarded).result(Err(Failure::of(error))),
+                    };
+                    emitter.emit(event.number(index as u64)).await;
                 }
-                emitter.emit(Event::Ended(Ok(()))).await;
+                emitter.emit(Event::ended(Ok(()))).await;
                 Ok(())
             }),
         );

@@ -12,13 +12,11 @@ use tokio::sync::{Notify, mpsc, oneshot};
 
 use crate::agent::OwnAgent;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, GivenHandle, Items, OperationHandle, script};
-use crate::message::{Draft, FipaMessage, Letter};
-use crate::raw::{FipaBytes, FipaText, limit, put, writable};
-use crate::table::{self, FipaHandle};
-
-/// Time limit of a conversation for which the caller sets none: a year.
-pub(crate) const LONG: Duration = Duration::from_secs(365 * 24 * 60 * 60);
+use crate::item::{Event, FipaEvent, GivenHandle, Items, OperationHandle, script};
+use crate::letter::{FipaMessage, Letter};
+use crate::message::Draft;
+use crate::raw::{FipaBytes, FipaText, LONG, limit, put, writable};
+use crate::table::{self, FipaHandle, Object};
 
 /// Time for the answer to a cancel.
 const CANCEL: Duration = Duration::from_secs(10);
@@ -76,7 +74,7 @@ pub unsafe extern "C" fn fipa_request(
         };
         let result = Letter::from(result.wait().or_fail()?);
         // SAFETY: The caller promises it.
-        unsafe { put(answer, table::add(result), "the handle") }?;
+        unsafe { put(answer, table::add(Arc::new(result)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -109,7 +107,7 @@ pub unsafe extern "C" fn fipa_begin_request(
                 tokio::select! {
                     agreed = request.agreed() => {
                         if agreed.or_fail()? {
-                            emitter.emit(Event::Agreed).await;
+                            emitter.emit(Event::of(FipaEvent::Agreed)).await;
                         }
                         break;
                     }
@@ -122,12 +120,13 @@ pub unsafe extern "C" fn fipa_begin_request(
                     () = cancelling.notified() => cancelled(&mut request).await.or_fail()?,
                 }
             };
-            emitter.emit(Event::Answer(answer.into())).await;
+            let answer = Letter::from(answer);
+            emitter.emit(Event::with(FipaEvent::Answer, answer)).await;
             Ok(())
         });
         let began = OperationHandle::cancellable(own.items.follow(tag, events), cancel);
         // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(began), "the handle") }?;
+        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -139,9 +138,8 @@ async fn cancelled(request: &mut Request) -> Result<(), DialogueError> {
 
 /// A conversation that this agent serves. Its task runs in the background until the last message, or until this
 /// value is dropped.
-pub(crate) struct OpenTask {
-    pub(crate) first: Letter,
-    pub(crate) handle: GivenHandle,
+struct OpenTask {
+    first: Letter,
     commands: mpsc::Sender<(Command, Done)>,
     items: Items,
 }
@@ -157,14 +155,21 @@ enum Command {
 }
 
 /// A running server.
-pub(crate) struct OpenServer {
+struct OpenServer {
     _server: Server,
     operation: OperationHandle,
 }
 
-impl OpenServer {
-    pub(crate) fn end(&self) {
+impl Object for OpenTask {
+    fn letter(&self) -> Option<&Letter> {
+        Some(&self.first)
+    }
+}
+
+impl Object for OpenServer {
+    fn close(&self) -> Result<(), Failure> {
         self.operation.end();
+        Ok(())
     }
 }
 
@@ -203,7 +208,7 @@ pub unsafe extern "C" fn fipa_serve(
             operation: OperationHandle::of(own.items.follow(tag, received)),
         };
         // SAFETY: The caller promises it.
-        unsafe { put(server, table::add(open), "the handle") }?;
+        unsafe { put(server, table::add(Arc::new(open)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -218,11 +223,13 @@ async fn handle(
     let handle = GivenHandle::default();
     let open = OpenTask {
         first: Letter::from(task.message().clone()),
-        handle: Arc::clone(&handle),
         commands,
         items,
     };
-    if events.send(Event::Task(open)).is_err() {
+    if events
+        .send(Event::giving(FipaEvent::Task, open, &handle))
+        .is_err()
+    {
         return Err("the program has ended its server");
     }
     let mut goes_on = true;
@@ -233,7 +240,7 @@ async fn handle(
                 goes_on = false;
                 let cancelled = cancelled.map_err(Failure::of);
                 // The program may have ended its server; it still can answer.
-                let _ = events.send(Event::Cancel(Arc::clone(&handle), cancelled));
+                let _ = events.send(Event::about(FipaEvent::Cancel, &handle).result(cancelled));
                 continue;
             }
         };
@@ -245,7 +252,8 @@ async fn handle(
             Command::Notify(content) => task.inform(content).await,
             Command::Propose(content) => match task.propose(content, LONG).await {
                 Ok(accepted) => {
-                    let _ = events.send(Event::Decision(Arc::clone(&handle), accepted));
+                    let decision = Event::about(FipaEvent::Decision, &handle);
+                    let _ = events.send(decision.number(accepted.into()));
                     if !accepted {
                         let _ = done.send(Ok(()));
                         return Ok(Reply::Nothing);
@@ -365,7 +373,7 @@ pub unsafe extern "C" fn fipa_begin_task_reply(
         // SAFETY: The caller promises it.
         let content = unsafe { copied(content) }?;
         let sent = task.command(Command::of(act, content)?);
-        task.items.begin(tag, async { Event::Ended(sent.await) });
+        task.items.begin(tag, async { Event::ended(sent.await) });
         Ok(FipaResult::Ok)
     })
 }

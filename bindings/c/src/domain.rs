@@ -1,24 +1,18 @@
 //! Domains: joining, the directory, and the routes.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use fipa::blocking::{self, Wait};
 use fipa::config::Sources;
-use fipa::error::DeregisterError;
 use fipa::{Change, Config, Domain, Matcher, Query};
 use futures_util::StreamExt as _;
-use serde::Serialize;
 use serde_json::{Value, json};
 
-use crate::actions::{OpenGoal, OpenOffer};
-use crate::agent::OwnAgent;
-use crate::coalitions::CoalitionMember;
-use crate::contract_net::OpenCall;
-use crate::conversation::OpenServer;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, Items, OperationHandle, failed};
+use crate::item::{Event, FipaEvent, Items, OperationHandle, Text};
 use crate::raw::{Extensible, FipaText, Readable, put, structure, texts, writable};
-use crate::table::{self, FipaHandle};
+use crate::table::{self, FipaHandle, Object};
 
 /// How a process joins a domain. A field that is zero is not set.
 #[repr(C)]
@@ -46,14 +40,10 @@ pub(crate) struct Membership {
     pub(crate) items: Items,
 }
 
-/// A text that the caller reads.
-pub(crate) struct Text(String);
-
-impl Text {
-    pub(crate) fn json(value: &impl Serialize) -> Result<Self, Failure> {
-        let text = serde_json::to_string(value);
-        let text = text.map_err(|error| Failure::new(FipaResult::Failed, error.to_string()));
-        text.map(Self)
+impl Object for Membership {
+    fn close(&self) -> Result<(), Failure> {
+        self.domain.clone().close().wait();
+        Ok(())
     }
 }
 
@@ -78,7 +68,7 @@ pub unsafe extern "C" fn fipa_open(
             items: Items::new(),
         };
         // SAFETY: The caller promises it.
-        unsafe { put(domain, table::add(membership), "the handle") }?;
+        unsafe { put(domain, table::add(Arc::new(membership)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -135,7 +125,13 @@ pub unsafe extern "C" fn fipa_agents(
         let mut found = membership.domain.agents();
         found.retain(|entry| query.matches(entry));
         // SAFETY: The caller promises it.
-        unsafe { put(agents, table::add(Text::json(&found)?), "the handle") }?;
+        unsafe {
+            put(
+                agents,
+                table::add(Arc::new(Text::json(&found)?)),
+                "the handle",
+            )
+        }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -165,7 +161,13 @@ pub unsafe extern "C" fn fipa_routes(
         };
         let report = membership.domain.routes(&query);
         // SAFETY: The caller promises it.
-        unsafe { put(routes, table::add(Text::json(&report)?), "the handle") }?;
+        unsafe {
+            put(
+                routes,
+                table::add(Arc::new(Text::json(&report)?)),
+                "the handle",
+            )
+        }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -189,14 +191,14 @@ pub unsafe extern "C" fn fipa_follow_agents(
             let mut all = Vec::new();
             flatten(&change, &mut all);
             let events = all.into_iter().map(|json| match Text::json(&json) {
-                Ok(text) => Event::Change(text),
-                Err(failure) => failed(failure),
+                Ok(text) => Event::with(FipaEvent::Change, text),
+                Err(failure) => Event::ended(Err(failure)),
             });
             futures_util::stream::iter(events.collect::<Vec<_>>())
         });
         let began = OperationHandle::of(membership.items.follow(tag, changes));
         // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(began), "the handle") }?;
+        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -210,58 +212,4 @@ fn flatten(change: &Change, all: &mut Vec<Value>) {
         Change::Lagged => all.push(json!({ "change": "lagged" })),
         Change::Together(changes) => changes.iter().for_each(|change| flatten(change, all)),
     }
-}
-
-/// Returns the text of a handle: of a JSON text, of the answers to a call for proposals, or of the arguments of a goal.
-/// It is valid until the handle is closed.
-///
-/// # Safety
-/// `text` is NULL or can be written.
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn fipa_read_text(handle: FipaHandle, text: *mut FipaText) -> FipaResult {
-    call(|| {
-        let object = table::any(handle)?;
-        let own = object
-            .downcast_ref::<Text>()
-            .or_else(|| object.downcast_ref().map(OpenCall::answers))
-            .or_else(|| object.downcast_ref().map(OpenGoal::arguments));
-        let own = own.ok_or_else(|| table::other_kind(handle, "Text"))?;
-        // SAFETY: The caller promises it.
-        unsafe { put(text, FipaText::of(&own.0), "the text") }?;
-        Ok(FipaResult::Ok)
-    })
-}
-
-/// Closes a handle of any kind. What was read from it is no longer valid.
-///
-/// A domain is left, and letters in transit get one second; an agent is deregistered; a lock is released; a task that
-/// has no answer fails; an operation ends, without a further item; an open loan is dropped.
-#[unsafe(no_mangle)]
-pub extern "C" fn fipa_close(handle: FipaHandle) -> FipaResult {
-    call(|| {
-        let object = table::remove(handle)?;
-        #[cfg(feature = "gateway")]
-        if let Some(gateway) = object.downcast_ref::<crate::gateway::OpenGateway>() {
-            gateway.end();
-        }
-        if let Some(membership) = object.downcast_ref::<Membership>() {
-            membership.domain.clone().close().wait();
-        } else if let Some(operation) = object.downcast_ref::<OperationHandle>() {
-            operation.end();
-        } else if let Some(offer) = object.downcast_ref::<OpenOffer>() {
-            offer.end();
-        } else if let Some(member) = object.downcast_ref::<CoalitionMember>() {
-            member.end();
-        } else if let Some(server) = object.downcast_ref::<OpenServer>() {
-            server.end();
-        } else if let Some(own) = object.downcast_ref::<OwnAgent>() {
-            // Operations hold further handles of the agent.
-            match own.agent.clone().deregister() {
-                // The domain was closed before, which has deregistered the agent.
-                Ok(_) | Err(DeregisterError::Closed) => {}
-                Err(error) => return Err(Failure::of(error)),
-            }
-        }
-        Ok(FipaResult::Ok)
-    })
 }

@@ -10,7 +10,6 @@ use fipa::locks::LockError;
 use fipa::protocol::DialogueError;
 
 use crate::fork;
-use crate::raw::FipaText;
 
 /// The result of a call. Zero is success, a positive number is success without a value, and a negative
 /// number is a failure. `fipa_error` has its text.
@@ -185,9 +184,9 @@ thread_local! {
     static LAST: RefCell<String> = const { RefCell::new(String::new()) };
 }
 
-/// Returns the text of the last failure of this thread, until its next one. Empty if none has failed.
-pub(crate) fn last() -> FipaText {
-    LAST.with_borrow(|text| FipaText::of(text))
+/// Reads the text of the last failure of this thread, which stays until its next one. Empty if none has failed.
+pub(crate) fn last<T>(read: impl FnOnce(&str) -> T) -> T {
+    LAST.with_borrow(|text| read(text))
 }
 
 /// Runs the body of a call: an error becomes its code, and a panic does not reach the caller.

@@ -1,22 +1,25 @@
 //! A gateway in the process of the program.
 
+use std::sync::Arc;
+
 use fipa::Gateway;
 use fipa::blocking::{self, Wait};
 use parking_lot::Mutex;
 
 use crate::domain::{FipaDomainOptions, configured};
-use crate::failure::{FipaResult, OrFail, call};
+use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::raw::{put, writable};
-use crate::table::{self, FipaHandle};
+use crate::table::{self, FipaHandle, Object};
 
 /// A running gateway, until the caller closes it.
-pub(crate) struct OpenGateway(Mutex<Option<Gateway>>);
+struct OpenGateway(Mutex<Option<Gateway>>);
 
-impl OpenGateway {
-    pub(crate) fn end(&self) {
+impl Object for OpenGateway {
+    fn close(&self) -> Result<(), Failure> {
         if let Some(gateway) = self.0.lock().take() {
             gateway.close().wait();
         }
+        Ok(())
     }
 }
 
@@ -38,7 +41,7 @@ pub unsafe extern "C" fn fipa_open_gateway(
         let opened = Gateway::open(&config).wait().or_fail()?;
         let open = OpenGateway(Mutex::new(Some(opened)));
         // SAFETY: The caller promises it.
-        unsafe { put(gateway, table::add(open), "the handle") }?;
+        unsafe { put(gateway, table::add(Arc::new(open)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }

@@ -1,24 +1,16 @@
-//! The queue of a domain.
+//! The events of operations, and the items that they become.
 
-use std::any::Any;
-use std::os::fd::AsRawFd as _;
 use std::sync::{Arc, OnceLock};
 
-use fipa::Deliveries;
 use fipa_queue::{Operation, Queue};
 use futures_core::Stream;
 use futures_util::stream::poll_fn;
+use serde::Serialize;
 use tokio::sync::{Notify, mpsc};
 
-use crate::actions::OpenGoal;
-use crate::contract_net::OpenCall;
-use crate::conversation::OpenTask;
-use crate::domain::{Membership, Text};
-use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::locks::HeldLock;
-use crate::message::Letter;
-use crate::raw::{self, Extensible, fill, fillable, put};
-use crate::table::{self, FipaHandle};
+use crate::failure::{Failure, FipaResult};
+use crate::raw::Extensible;
+use crate::table::{self, FipaHandle, Object};
 
 pub(crate) type Items = Queue<Event>;
 
@@ -92,136 +84,119 @@ pub struct FipaItem {
 // SAFETY: It begins with a `usize`.
 unsafe impl Extensible for FipaItem {}
 
-/// An event of an operation.
-pub(crate) enum Event {
-    Ended(Result<(), Failure>),
-    Outcomes(Deliveries),
-    Letter(Letter),
-    Change(Text),
-    Agreed,
-    Answer(Letter),
-    Task(OpenTask),
-    Notification(Letter, u64),
-    Interrupted(Failure),
-    Lock(HeldLock),
-    Cancel(GivenHandle, Result<(), Failure>),
-    Bids(OpenCall),
-    Awarded(usize, Result<Letter, Failure>),
-    Decision(GivenHandle, bool),
-    Goal(OpenGoal),
-    Stop(GivenHandle, Failure),
-    Accepted,
-    Progress(Text),
-    Result(Text),
-}
-
 /// The handle of a task or goal, once the caller has it.
 pub(crate) type GivenHandle = Arc<OnceLock<FipaHandle>>;
 
-pub(crate) fn failed(failure: Failure) -> Event {
-    Event::Ended(Err(failure))
+/// An event of an operation, before it is an item.
+pub(crate) struct Event {
+    kind: FipaEvent,
+    result: Result<(), Failure>,
+    subject: Subject,
+    number: u64,
+}
+
+/// The object of an event.
+enum Subject {
+    None,
+    /// It gets a handle, which later events may name.
+    New(Arc<dyn Object>, Option<GivenHandle>),
+    /// Its item has come before.
+    Given(GivenHandle),
 }
 
 impl Event {
-    fn into_item(self, tag: u64) -> Result<FipaItem, Failure> {
-        let item = |kind, handle| FipaItem {
+    pub(crate) fn of(kind: FipaEvent) -> Self {
+        Self {
+            kind,
+            result: Ok(()),
+            subject: Subject::None,
+            number: 0,
+        }
+    }
+
+    /// An event with an object.
+    pub(crate) fn with(kind: FipaEvent, object: impl Object) -> Self {
+        Self {
+            subject: Subject::New(Arc::new(object), None),
+            ..Self::of(kind)
+        }
+    }
+
+    /// An event with an object whose later events name its handle.
+    pub(crate) fn giving(kind: FipaEvent, object: impl Object, handle: &GivenHandle) -> Self {
+        Self {
+            subject: Subject::New(Arc::new(object), Some(Arc::clone(handle))),
+            ..Self::of(kind)
+        }
+    }
+
+    /// An event about an object whose item has come before.
+    pub(crate) fn about(kind: FipaEvent, handle: &GivenHandle) -> Self {
+        Self {
+            subject: Subject::Given(Arc::clone(handle)),
+            ..Self::of(kind)
+        }
+    }
+
+    /// The end of an operation.
+    pub(crate) fn ended(result: Result<(), Failure>) -> Self {
+        Self::of(FipaEvent::Ended).result(result)
+    }
+
+    pub(crate) fn result(self, result: Result<(), Failure>) -> Self {
+        Self { result, ..self }
+    }
+
+    pub(crate) fn number(self, number: u64) -> Self {
+        Self { number, ..self }
+    }
+
+    /// Gives the object its handle, and this thread the text of a failure.
+    pub(crate) fn into_item(self, tag: u64) -> FipaItem {
+        let handle = match self.subject {
+            Subject::None => 0,
+            Subject::New(object, given) => {
+                let handle = table::add(object);
+                if let Some(given) = given {
+                    // An object is an item once.
+                    let _ = given.set(handle);
+                }
+                handle
+            }
+            Subject::Given(given) => given.get().copied().unwrap_or(0),
+        };
+        FipaItem {
             size: size_of::<FipaItem>(),
             tag,
-            kind,
-            result: FipaResult::Ok,
+            kind: self.kind,
+            result: match self.result {
+                Ok(()) => FipaResult::Ok,
+                Err(failure) => failure.store(),
+            },
             handle,
-            number: 0,
-        };
-        Ok(match self {
-            Self::Ended(ended) => FipaItem {
-                result: result(ended),
-                ..item(FipaEvent::Ended, 0)
-            },
-            Self::Outcomes(outcomes) => FipaItem {
-                result: outcome(&outcomes),
-                ..item(FipaEvent::Outcomes, table::add(Text::json(&outcomes)?))
-            },
-            Self::Letter(letter) => item(FipaEvent::Letter, table::add(letter)),
-            Self::Change(change) => item(FipaEvent::Change, table::add(change)),
-            Self::Agreed => item(FipaEvent::Agreed, 0),
-            Self::Answer(letter) => item(FipaEvent::Answer, table::add(letter)),
-            Self::Task(task) => {
-                let given = Arc::clone(&task.handle);
-                item(FipaEvent::Task, give(task, &given))
-            }
-            Self::Notification(letter, missed) => FipaItem {
-                number: missed,
-                ..item(FipaEvent::Notification, table::add(letter))
-            },
-            Self::Interrupted(failure) => FipaItem {
-                result: failure.store(),
-                ..item(FipaEvent::Interrupted, 0)
-            },
-            Self::Lock(lock) => item(FipaEvent::Lock, table::add(lock)),
-            // The item of the task has come before.
-            Self::Cancel(task, cause) => FipaItem {
-                result: result(cause),
-                ..item(FipaEvent::Cancel, given(&task))
-            },
-            Self::Bids(call) => FipaItem {
-                number: call.proposals() as u64,
-                ..item(FipaEvent::Bids, table::add(call))
-            },
-            Self::Awarded(index, result) => {
-                let (handle, result) = match result {
-                    Ok(letter) => (table::add(letter), FipaResult::Ok),
-                    Err(failure) => (0, failure.store()),
-                };
-                FipaItem {
-                    result,
-                    number: index as u64,
-                    ..item(FipaEvent::Awarded, handle)
-                }
-            }
-            Self::Decision(task, accepted) => FipaItem {
-                number: accepted.into(),
-                ..item(FipaEvent::Decision, given(&task))
-            },
-            Self::Goal(goal) => {
-                let given = Arc::clone(&goal.handle);
-                item(FipaEvent::Goal, give(goal, &given))
-            }
-            Self::Stop(goal, cause) => FipaItem {
-                result: cause.store(),
-                ..item(FipaEvent::Stop, given(&goal))
-            },
-            Self::Accepted => item(FipaEvent::Accepted, 0),
-            Self::Progress(progress) => item(FipaEvent::Progress, table::add(progress)),
-            Self::Result(result) => item(FipaEvent::Result, table::add(result)),
-        })
+            number: self.number,
+        }
     }
 }
 
-/// Gives an object a handle that its later events can name.
-fn give<T: Any + Send + Sync>(object: T, given: &GivenHandle) -> FipaHandle {
-    let handle = table::add(object);
-    // An object is an item once.
-    let _ = given.set(handle);
-    handle
-}
+/// A text that the caller reads.
+pub(crate) struct Text(String);
 
-/// Returns the handle of an object whose item has come before.
-fn given(handle: &GivenHandle) -> FipaHandle {
-    handle.get().copied().unwrap_or(0)
-}
+impl Text {
+    pub(crate) fn json(value: &impl Serialize) -> Result<Self, Failure> {
+        let text = serde_json::to_string(value);
+        let text = text.map_err(|error| Failure::new(FipaResult::Failed, error.to_string()));
+        text.map(Self)
+    }
 
-fn result(result: Result<(), Failure>) -> FipaResult {
-    match result {
-        Ok(()) => FipaResult::Ok,
-        Err(failure) => failure.store(),
+    pub(crate) fn as_str(&self) -> &str {
+        &self.0
     }
 }
 
-/// The result of a message with these outcomes. The text of a failure lists them.
-pub(crate) fn outcome(outcomes: &Deliveries) -> FipaResult {
-    match outcomes.all_succeeded() {
-        true => FipaResult::Ok,
-        false => Failure::new(FipaResult::NotDelivered, outcomes.to_string()).store(),
+impl Object for Text {
+    fn text(&self) -> Option<&str> {
+        Some(&self.0)
     }
 }
 
@@ -246,7 +221,7 @@ where
     let running = run(emitter.clone());
     let mut running = Some(Box::pin(async move {
         if let Err(failure) = running.await {
-            emitter.emit(failed(failure)).await;
+            emitter.emit(Event::ended(Err(failure))).await;
         }
     }));
     poll_fn(move |context| {
@@ -278,58 +253,16 @@ impl OperationHandle {
     pub(crate) fn end(&self) {
         self.operation.abandon();
     }
+
+    /// Asks the operation to cancel its conversation.
+    pub(crate) fn cancel(&self) {
+        self.cancel.notify_one();
+    }
 }
 
-/// Takes the next item of a domain; waits for it up to `timeout_ms`, or without a limit if that is negative. Returns
-/// `FIPA_RESULT_EMPTY` if there is none. Several threads may wait; each item goes to one of them.
-///
-/// # Safety
-/// `item` is NULL, or its first field is the number of bytes that can be written there.
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn fipa_next(
-    domain: FipaHandle,
-    timeout_ms: i64,
-    item: *mut FipaItem,
-) -> FipaResult {
-    call(|| {
-        // SAFETY: The caller promises it. An item that cannot be written must not be taken.
-        unsafe { fillable(item, "the item") }?;
-        let membership = table::get::<Membership>(domain)?;
-        let Some(next) = membership.items.next(raw::limit(timeout_ms)) else {
-            return Ok(FipaResult::Empty);
-        };
-        let next = next.event.into_item(next.tag)?;
-        // SAFETY: The caller promises it.
-        unsafe { fill(item, next, "the item") }?;
-        Ok(FipaResult::Ok)
-    })
-}
-
-/// Returns a descriptor for poll, epoll or an event loop. It is readable from before an item can be taken until
-/// `fipa_next` with a time limit of 0 has returned `FIPA_RESULT_EMPTY`. It may be readable without an item. The caller
-/// neither reads nor closes it, and stops polling it before it closes the domain.
-///
-/// # Safety
-/// `fd` is NULL or can be written.
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn fipa_fd(domain: FipaHandle, fd: *mut i32) -> FipaResult {
-    call(|| {
-        let membership = table::get::<Membership>(domain)?;
-        let descriptor = membership.items.descriptor().or_fail()?.as_raw_fd();
-        // SAFETY: The caller promises it.
-        unsafe { put(fd, descriptor, "the fd") }?;
-        Ok(FipaResult::Ok)
-    })
-}
-
-/// Asks the other side to cancel the conversation of an operation. The operation then ends with
-/// `FIPA_RESULT_CANCELLED`, or with its result if the other side goes on.
-#[unsafe(no_mangle)]
-pub extern "C" fn fipa_cancel(operation: FipaHandle) -> FipaResult {
-    call(|| {
-        table::get::<OperationHandle>(operation)?
-            .cancel
-            .notify_one();
-        Ok(FipaResult::Ok)
-    })
+impl Object for OperationHandle {
+    fn close(&self) -> Result<(), Failure> {
+        self.end();
+        Ok(())
+    }
 }

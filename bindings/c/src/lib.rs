@@ -10,7 +10,9 @@ mod failure;
 mod fork;
 #[cfg(feature = "gateway")]
 mod gateway;
+mod handles;
 mod item;
+mod letter;
 mod locks;
 mod message;
 mod raw;
@@ -26,7 +28,9 @@ pub use crate::domain::*;
 pub use crate::failure::FipaResult;
 #[cfg(feature = "gateway")]
 pub use crate::gateway::*;
-pub use crate::item::*;
+pub use crate::handles::*;
+pub use crate::item::{FipaEvent, FipaItem};
+pub use crate::letter::{FipaLetterInfo, FipaMessage, FipaParameter};
 pub use crate::locks::*;
 pub use crate::message::*;
 pub use crate::raw::{FipaBytes, FipaText};
@@ -43,5 +47,5 @@ pub extern "C" fn fipa_version() -> FipaText {
 /// next failure of this thread, and empty if none has failed.
 #[unsafe(no_mangle)]
 pub extern "C" fn fipa_error() -> FipaText {
-    failure::last()
+    failure::last(FipaText::of)
 }

@@ -1,19 +1,18 @@
 //! Locks of resources, and their owners.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use fipa::blocking::Wait;
 use fipa::locks::{Lock, LockError, OwnOptions, Owned};
-use fipa::{Agent, MessageBuilder};
+use fipa::{Agent, Message, MessageBuilder};
 
 use crate::agent::OwnAgent;
-use crate::coalitions::CoalitionMember;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, OperationHandle, script};
-use crate::message::LetterRef;
+use crate::item::{Event, FipaEvent, OperationHandle, script};
 use crate::raw::{Extensible, FipaText, Readable, fill, limit, put, structure, texts, writable};
-use crate::table::{self, FipaHandle};
+use crate::table::{self, FipaHandle, Object};
 
 /// A lock that the caller holds.
 pub(crate) struct HeldLock {
@@ -25,6 +24,12 @@ impl HeldLock {
     fn new(lock: Lock) -> Self {
         let fence = lock.fence().map(ToString::to_string);
         Self { lock, fence }
+    }
+}
+
+impl Object for HeldLock {
+    fn guard(&self, message: MessageBuilder) -> Option<Result<MessageBuilder, Failure>> {
+        Some(Ok(self.lock.guard(message)))
     }
 }
 
@@ -49,7 +54,7 @@ pub unsafe extern "C" fn fipa_lock(
         let acquired = acquire(&own.agent, &resources, limit(timeout_ms)).wait();
         let held = HeldLock::new(acquired.or_fail()?);
         // SAFETY: The caller promises it.
-        unsafe { put(lock, table::add(held), "the handle") }?;
+        unsafe { put(lock, table::add(Arc::new(held)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -105,12 +110,14 @@ pub unsafe extern "C" fn fipa_begin_lock(
             let resources: Vec<&str> = resources.iter().map(String::as_str).collect();
             let lock = acquire(&agent, &resources, within).await.or_fail()?;
             let lost = lock.lost();
-            emitter.emit(Event::Lock(HeldLock::new(lock))).await;
+            emitter
+                .emit(Event::with(FipaEvent::Lock, HeldLock::new(lock)))
+                .await;
             Err(Failure::of(lost.await))
         });
         let began = OperationHandle::of(own.items.follow(tag, events));
         // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(began), "the handle") }?;
+        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -180,6 +187,12 @@ unsafe impl Readable for FipaOwnOptions {}
 /// A resource that an agent owns.
 struct OpenOwned(Owned);
 
+impl Object for OpenOwned {
+    fn check(&self, message: &Message) -> Option<Result<(), Failure>> {
+        Some(self.0.check(message).map(drop).or_fail())
+    }
+}
+
 /// Owns a resource, whose locks other agents then request. `options` may be NULL. `fipa_close` ends it.
 ///
 /// # Safety
@@ -200,7 +213,7 @@ pub unsafe extern "C" fn fipa_own(
         let options = unsafe { own_options(options) }?;
         let open = OpenOwned(own.agent.own(resource, options).wait().or_fail()?);
         // SAFETY: The caller promises it.
-        unsafe { put(owned, table::add(open), "the handle") }?;
+        unsafe { put(owned, table::add(Arc::new(open)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -233,31 +246,11 @@ pub(crate) unsafe fn own_options(options: *const FipaOwnOptions) -> Result<OwnOp
 #[unsafe(no_mangle)]
 pub extern "C" fn fipa_check_fence(guard: FipaHandle, letter: FipaHandle) -> FipaResult {
     call(|| {
-        let object = table::any(guard)?;
-        let letter = LetterRef::of(letter)?;
-        let message = letter.get()?.message();
-        if let Some(member) = object.downcast_ref::<CoalitionMember>() {
-            member.membership.check(message).or_fail()?;
-        } else {
-            let owned = object.downcast_ref::<OpenOwned>();
-            let owned = owned.ok_or_else(|| table::other_kind(guard, "OpenOwned"))?;
-            owned.0.check(message).or_fail()?;
-        }
+        let (object, of_letter) = (table::any(guard)?, table::any(letter)?);
+        let own = of_letter.letter();
+        let own = own.ok_or_else(|| table::other_kind(letter, "Letter"))?;
+        let checked = object.check(own.message());
+        checked.ok_or_else(|| table::other_kind(guard, "OpenOwned"))??;
         Ok(FipaResult::Ok)
     })
-}
-
-/// Adds the fences of a lock, or that of the leader of a coalition, to a message.
-pub(crate) fn guard(
-    handle: FipaHandle,
-    message: MessageBuilder,
-) -> Result<MessageBuilder, Failure> {
-    let object = table::any(handle)?;
-    if let Some(held) = object.downcast_ref::<HeldLock>() {
-        return Ok(held.lock.guard(message));
-    }
-    let member = object.downcast_ref::<CoalitionMember>();
-    let member = member.ok_or_else(|| table::other_kind(handle, "HeldLock"))?;
-    let guarded = member.membership.guard(message);
-    guarded.map_err(|error| Failure::new(FipaResult::Lost, error.to_string()))
 }

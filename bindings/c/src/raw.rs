@@ -7,6 +7,9 @@ use std::{ptr, slice};
 
 use crate::failure::Failure;
 
+/// Time limit of a conversation for which the caller sets none: a year.
+pub(crate) const LONG: Duration = Duration::from_secs(365 * 24 * 60 * 60);
+
 /// Maximum number of elements of a list from the caller, far above what a message may have.
 const MAX_LIST: usize = 65_536;
 

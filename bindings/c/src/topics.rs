@@ -12,10 +12,11 @@ use parking_lot::Mutex;
 use crate::agent::OwnAgent;
 use crate::conversation::copied;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, OperationHandle, script};
-use crate::message::{Draft, FipaMessage};
+use crate::item::{Event, FipaEvent, OperationHandle, script};
+use crate::letter::{FipaMessage, Letter};
+use crate::message::Draft;
 use crate::raw::{Extensible, FipaBytes, FipaText, Readable, limit, put, structure, writable};
-use crate::table::{self, FipaHandle};
+use crate::table::{self, FipaHandle, Object};
 
 /// Time for the answer to a subscription, if the caller sets none.
 const TIMEOUT: Duration = Duration::from_secs(30);
@@ -51,6 +52,10 @@ struct OpenTopicLoan {
     loan: Mutex<Option<TopicLoan>>,
 }
 
+impl Object for OpenPublisher {}
+
+impl Object for OpenTopicLoan {}
+
 /// Publishes a topic: accepts the subscriptions whose content is its name (FIPA00035). `fipa_close` ends it.
 ///
 /// # Safety
@@ -84,7 +89,13 @@ pub unsafe extern "C" fn fipa_publisher(
         described = described.latched(topic.latched);
         let opened = async { own.agent.publisher(described) }.wait().or_fail()?;
         // SAFETY: The caller promises it.
-        unsafe { put(publisher, table::add(OpenPublisher(opened)), "the handle") }?;
+        unsafe {
+            put(
+                publisher,
+                table::add(Arc::new(OpenPublisher(opened))),
+                "the handle",
+            )
+        }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -136,7 +147,7 @@ pub unsafe extern "C" fn fipa_loan_notification(
         // SAFETY: The caller promises it.
         unsafe { put(content, memory, "the content") }?;
         // SAFETY: The caller promises it.
-        unsafe { put(loan, table::add(open), "the handle") }?;
+        unsafe { put(loan, table::add(Arc::new(open)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
@@ -216,10 +227,11 @@ pub unsafe extern "C" fn fipa_subscribe(
                     .emit(match subscription.next().await {
                         Ok(notification) => {
                             let missed = notification.missed();
-                            Event::Notification(notification.into(), missed)
+                            let letter = Letter::from(notification);
+                            Event::with(FipaEvent::Notification, letter).number(missed)
                         }
                         Err(error) if subscription.goes_on() => {
-                            Event::Interrupted(Failure::of(error))
+                            Event::of(FipaEvent::Interrupted).result(Err(Failure::of(error)))
                         }
                         Err(error) => return Err(Failure::of(error)),
                     })
@@ -228,7 +240,7 @@ pub unsafe extern "C" fn fipa_subscribe(
         });
         let began = OperationHandle::of(own.items.follow(tag, events));
         // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(began), "the handle") }?;
+        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
         Ok(FipaResult::Ok)
     })
 }
