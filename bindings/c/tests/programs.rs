@@ -4,9 +4,8 @@
 
 use std::time::Duration;
 
+use fipa::Performative;
 use fipa::blocking::Wait;
-use fipa::config::Sources;
-use fipa::{Config, Domain, Performative};
 use fipa_testbed::{ChildGuard, can_run, until};
 
 use support::{C, SHARED, STATIC, Workshop, bindings, run, run_sanitized};
@@ -74,10 +73,7 @@ fn an_agent_in_rust_requests_from_one_in_c() {
     let arm = workshop.compile("cc", &bindings("c/examples/arm.c"), "arm", C, SHARED);
     let (mut process, ready) = ChildGuard::until_ready(&mut workshop.command(&arm, &[]));
     assert_eq!(ready.trim(), "arm_1 is ready");
-    let mut sources = Sources::from_environment();
-    sources.file = Some(workshop.config());
-    let config = Config::load(&sources).expect("the configuration is right");
-    let domain = Domain::open(&config).wait().expect("a domain");
+    let domain = workshop.domain();
     let rover = domain.register("rover").wait().expect("a name");
     let ask = |content: &'static str| {
         let message = rover.message(Performative::Request).receiver("arm_1");

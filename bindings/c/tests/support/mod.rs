@@ -7,6 +7,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use fipa::blocking::Wait as _;
+use fipa::config::Sources;
+use fipa::{Config, Domain};
+
 pub(crate) const SHARED: &[&str] = &["-lfipa_c"];
 pub(crate) const STATIC: &[&str] = &["-l:libfipa_c.a", "-lpthread", "-ldl", "-lm"];
 
@@ -61,6 +65,14 @@ impl Workshop {
         self.dir.path().join("fipa.toml")
     }
 
+    /// Joins the domain of the programs.
+    pub(crate) fn domain(&self) -> Domain {
+        let mut sources = Sources::from_environment();
+        sources.file = Some(self.config());
+        let config = Config::load(&sources).expect("the configuration is right");
+        Domain::open(&config).wait().expect("a domain")
+    }
+
     /// Compiles a source with all headers in reach, and returns the program or what `flags` say to make.
     pub(crate) fn compile(
         &self,
@@ -110,6 +122,15 @@ impl Workshop {
             .env("FIPA_CONFIG", self.config())
             .env("LD_LIBRARY_PATH", self.path());
         command
+    }
+}
+
+impl Drop for Workshop {
+    /// A process that joins removes what programs that have crashed left in shared memory.
+    fn drop(&mut self) {
+        if self.path().join("run").exists() {
+            self.domain().close().wait();
+        }
     }
 }
 
