@@ -21,7 +21,7 @@ pub struct Unreachable {
 /// #     -> Result<(), Box<dyn std::error::Error>> {
 /// use std::time::Duration;
 ///
-/// let request = agent.request(lift, Duration::from_secs(60)).await?;
+/// let mut request = agent.request(lift, Duration::from_secs(60)).await?;
 /// let mut reachability = request.reachability();
 /// tokio::spawn(async move {
 ///     while reachability.changed().await {

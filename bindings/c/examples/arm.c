@@ -33,7 +33,7 @@ static int failed(const char *what, fipa_result result) {
   return 1;
 }
 
-/* ANCHOR: lift */
+// ANCHOR: lift
 static void lift(fipa_handle task) {
   fipa_bytes load;
   fipa_bytes done = {(const uint8_t *)"lifted", 6}, why = {(const uint8_t *)"lift what?", 10};
@@ -47,9 +47,9 @@ static void lift(fipa_handle task) {
   }
   fipa_close(task);
 }
-/* ANCHOR_END: lift */
+// ANCHOR_END: lift
 
-/* ANCHOR: loop */
+// ANCHOR: loop
 /* Takes items until the queue is empty; the descriptor is then readable when the next one comes. */
 static void take_items(fipa_handle domain) {
   fipa_item item = {.size = sizeof item};
@@ -59,7 +59,7 @@ static void take_items(fipa_handle domain) {
     }
   }
 }
-/* ANCHOR_END: loop */
+// ANCHOR_END: loop
 
 int main(void) {
   fipa_handle domain = 0, arm = 0, server = 0, temperature = 0;

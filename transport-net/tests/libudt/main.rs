@@ -48,9 +48,11 @@ fn peer() -> Option<&'static Path> {
     static BUILT: OnceLock<Option<PathBuf>> = OnceLock::new();
     let built = BUILT.get_or_init(|| {
         let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/libudt/peer.cpp");
-        let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("libudt-peer");
-        // Other processes may build it at the same time.
-        let built = program.with_extension(std::process::id().to_string());
+        let directory = Path::new(env!("CARGO_TARGET_TMPDIR"));
+        let program = directory.join("libudt-peer");
+        // Other processes may build it at the same time, with the same number in a namespace of their own.
+        let building = tempfile::tempdir_in(directory).unwrap();
+        let built = building.path().join("libudt-peer");
         let mut compiler = Command::new("g++");
         compiler.args(["-std=c++17", "-O2", "-o"]).arg(&built);
         let output = compiler.arg(&source).args(["-ludt", "-pthread"]).output();
