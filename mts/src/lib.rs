@@ -24,5 +24,5 @@ type Set<K> = std::collections::HashSet<K, foldhash::fast::RandomState>;
 pub use failure::DeliveryFailure;
 pub use gate::{AccessGate, LetterParts, LetterSource, Link};
 pub use post::{LetterDraft, PostError, letter_by, letter_for};
-pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};
+pub use runtime::{Contacts, Gone, Mts, RuntimeConfig, Sending, Started, Tap};
 pub use stamp::stamped_peer;

@@ -41,7 +41,7 @@ impl AccessGate for Calling {
         let service = self.service.get().unwrap().clone();
         let (ended, end) = mpsc::channel();
         thread::spawn(move || {
-            let received = service.try_receive(ARM).is_some();
+            let received = service.try_receive(ARM).unwrap().is_some();
             let _ = ended.send(received);
         });
         let waited = end.recv_timeout(TIMEOUT);
@@ -161,7 +161,7 @@ impl AccessGate for Queueing {
                 let other = thread::spawn(move || {
                     name.set(fs::read_link("/proc/thread-self").unwrap())
                         .unwrap();
-                    service.try_receive(ARM);
+                    service.try_receive(ARM).unwrap();
                 });
                 *self.other.lock() = Some(other);
                 // A thread may also sleep for a moment before it waits for this lock, when another

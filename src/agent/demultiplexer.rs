@@ -311,7 +311,7 @@ impl Demultiplexer {
             if set_aside.is_some() {
                 return set_aside;
             }
-            let received = has_room.then(|| endpoint.letter_now())??;
+            let received = has_room.then(|| endpoint.letter_now())?.ok()??;
             let own = self.put(endpoint, received, Reader::Conversation(key));
             if own.is_some() {
                 return own;
@@ -339,7 +339,7 @@ impl Demultiplexer {
             if let Some(set_aside) = self.change(|state| state.take(Reader::Others)) {
                 return Ok(Some(set_aside));
             }
-            match endpoint.letter_now() {
+            match endpoint.letter_now()? {
                 None => return Ok(None),
                 Some(received) => {
                     let own = self.put(endpoint, received, Reader::Others);

@@ -9,7 +9,7 @@ use fipa_acl::{
     AgentId, EnvelopeTemplate, ErrorChain, Letter, Message, MessageBuilder, Performative,
 };
 use fipa_mts::core::Received;
-use fipa_mts::{LetterDraft, Mts, PostError, letter_by};
+use fipa_mts::{Gone, LetterDraft, Mts, PostError, letter_by};
 use fipa_sds::{DeregisterError, Directory};
 use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
@@ -171,11 +171,16 @@ impl Endpoint {
     }
 
     /// Returns the next message, if one is available now. Skips letters that cannot be decoded.
-    pub(crate) fn letter_now(&self) -> Option<Incoming> {
+    pub(crate) fn letter_now(&self) -> Result<Option<Incoming>, ReceiveError> {
         loop {
-            let received = self.mts().try_receive(self.incarnation)?;
-            if let Some(incoming) = self.decode(received) {
-                return Some(incoming);
+            match self.mts().try_receive(self.incarnation) {
+                Err(Gone) => return Err(ReceiveError::Closed),
+                Ok(None) => return Ok(None),
+                Ok(Some(received)) => {
+                    if let Some(incoming) = self.decode(received) {
+                        return Ok(Some(incoming));
+                    }
+                }
             }
         }
     }

@@ -396,10 +396,7 @@ impl Agent {
         let endpoint = &self.core.endpoint;
         endpoint.domain.inner.owner.check()?;
         endpoint.mts().drive();
-        match self.core.demultiplexer.other_now(endpoint)? {
-            None if endpoint.mts().is_gone(endpoint.incarnation) => Err(ReceiveError::Closed),
-            received => Ok(received),
-        }
+        self.core.demultiplexer.other_now(endpoint)
     }
 
     /// Removes the name from the directory, and returns the messages that were delivered but not

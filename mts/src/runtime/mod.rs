@@ -110,6 +110,11 @@ pub trait Tap: Send + Sync {
     fn notice(&self, notice: &Notice);
 }
 
+/// The error if no more letters can arrive for an agent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the agent was deregistered, or the service closed")]
+pub struct Gone;
+
 /// A running message transport service.
 ///
 /// Cheap to clone; all clones are the same service. It runs until [`close`](Self::close).
@@ -552,7 +557,7 @@ impl Mts {
         self.shared
             .wait(&waiter.notify, || {
                 if waiter.ready.load(Ordering::Acquire)
-                    && let Some(received) = self.try_receive(agent)
+                    && let Ok(Some(received)) = self.try_receive(agent)
                 {
                     return Some(Some(received));
                 }
@@ -578,29 +583,31 @@ impl Mts {
         }
     }
 
-    /// Whether no more letters can arrive for this agent, because it was deregistered or the service closed.
-    #[must_use]
-    pub fn is_gone(&self, agent: Incarnation) -> bool {
-        let state = self.shared.lock();
-        let waiter = state.agents.get(&agent);
-        waiter.is_none_or(|waiter| waiter.gone.load(Ordering::Acquire))
-    }
-
     /// Returns the next letter for this agent if there is one.
-    pub fn try_receive(&self, agent: Incarnation) -> Option<Received> {
+    ///
+    /// # Errors
+    /// If there is none, and no more can arrive, because the agent was deregistered or the service closed.
+    pub fn try_receive(&self, agent: Incarnation) -> Result<Option<Received>, Gone> {
         let mut state = self.shared.lock();
         let received = state.core.take(agent);
         let more = state.core.waiting(agent) > 0;
+        let mut is_gone = true;
         if let Some(waiter) = state.agents.get(&agent) {
             waiter.ready.store(more, Ordering::Release);
             if more {
                 // Another task may be waiting for the same agent's letters.
                 waiter.notify.notify_one();
             }
+            is_gone = waiter.gone.load(Ordering::Acquire);
         }
-        let received = received?;
-        self.shared.carry_out(state);
-        Some(received)
+        match received {
+            Some(received) => {
+                self.shared.carry_out(state);
+                Ok(Some(received))
+            }
+            None if is_gone => Err(Gone),
+            None => Ok(None),
+        }
     }
 
     /// Reports that an agent took a letter whose message cannot be decoded; see
