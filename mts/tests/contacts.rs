@@ -56,7 +56,7 @@ impl Contacts for Publishing {
         let service = self.service.get().unwrap().clone();
         let (ended, end) = mpsc::channel();
         thread::spawn(move || {
-            let received = service.try_receive(OWN).unwrap().is_some();
+            let received = service.try_receive(OWN).is_ok_and(|it| it.is_some());
             let _ = ended.send(received);
         });
         let waited = end.recv_timeout(TIMEOUT);
