@@ -7,8 +7,8 @@
 //!
 //! This assumes that a rename is atomic, as on the journaling and copy-on-write file systems of Linux.
 //!
-//! What root creates in a directory of another user gets the owner and the group of that directory: the user of a
-//! service can read what an operator writes with `sudo`.
+//! Files and directories that root creates in a directory of another user get the owner and the group of that
+//! directory: the user of a service can read the files that an operator writes with `sudo`.
 
 #[cfg(test)]
 pub(crate) mod cuts;

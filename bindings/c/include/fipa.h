@@ -101,7 +101,7 @@ typedef int32_t fipa_result;
 #endif // __cplusplus
 
 /*
- What an item is, and what its handle refers to.
+ The kind of an item, which says what its handle refers to.
  */
 enum fipa_event
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -309,8 +309,8 @@ typedef struct fipa_parameter {
 /*
  The parameters of a message (FIPA00061). A parameter that is zero is not set.
 
- What a call reads from this structure is not used after the call. What `fipa_read_message` writes into it belongs
- to the letter, and is valid until the handle of the letter is closed.
+ A call does not use the structure, or anything that it points to, after the call. The texts and bytes that
+ `fipa_read_message` writes into it belong to the letter, and are valid until the handle of the letter is closed.
  */
 typedef struct fipa_message {
   /*
@@ -455,7 +455,7 @@ typedef struct fipa_item {
    */
   uint64_t tag;
   /*
-   What the item is.
+   The kind.
    */
   fipa_event kind;
   /*

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use fipa::AgentId;
 use fipa::actions::{
-    Action, ActionDescription, Cause, Execution, Goal, GoalStatus, Offer, Progress, Term,
+    Action, ActionDescription, Cause, Execution, Goal, GoalStatus, Progress, Term,
     arguments_from_json, term_from_json, term_to_json,
 };
 use fipa::blocking::Wait;
@@ -16,9 +16,9 @@ use tokio::sync::{Notify, mpsc, oneshot};
 
 use crate::agent::OwnAgent;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, FipaEvent, GivenHandle, OperationHandle, Text, script};
+use crate::item::{Event, FipaEvent, Following, GivenHandle, OperationHandle, Text, script};
 use crate::locks::HeldLock;
-use crate::raw::{FipaText, limit, put, writable};
+use crate::raw::{FipaText, Place, limit};
 use crate::table::{self, FipaHandle, Object};
 
 /// Time for the answer to a cancel.
@@ -39,19 +39,6 @@ impl Object for OpenGoal {
     }
 }
 
-/// An offered action.
-struct OpenOffer {
-    _offer: Offer,
-    operation: OperationHandle,
-}
-
-impl Object for OpenOffer {
-    fn close(&self) -> Result<(), Failure> {
-        self.operation.end();
-        Ok(())
-    }
-}
-
 /// Offers an action. `description` is a JSON object with a `name` and, as far as they are needed, `description`,
 /// `parameters` (each with `name`, `type` such as `number`, and `unit`, `range`, `default`, `description`,
 /// `optional`), `result` (a type), and `policy` (`reject`, `preempt`, or `{"queue": N}`). Each goal is an item of the
@@ -67,12 +54,13 @@ pub unsafe extern "C" fn fipa_offer(
     offer: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(offer, "the handle")?;
+        // SAFETY: The caller promises it.
+        let offer = unsafe { Place::of(offer, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let description = described(unsafe { description.required("the description") }?)?;
         // The robot admits a bounded number of goals, and each sends at most two events.
-        let (events, mut received) = mpsc::unbounded_channel();
+        let (events, received) = mpsc::unbounded_channel();
         let offered = async {
             own.agent
                 .offer(Action::from(description), move |arguments, execution| {
@@ -80,14 +68,8 @@ pub unsafe extern "C" fn fipa_offer(
                 })
         };
         let offered = offered.wait().or_fail()?;
-        let goals = futures_util::stream::poll_fn(move |context| received.poll_recv(context));
-        let open = OpenOffer {
-            _offer: offered,
-            operation: OperationHandle::of(own.items.follow(tag, goals)),
-        };
-        // SAFETY: The caller promises it.
-        unsafe { put(offer, table::add(Arc::new(open)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        let open = Following::new(&own.items, tag, offered, received);
+        Ok(table::give(offer, open))
     })
 }
 
@@ -236,7 +218,8 @@ pub unsafe extern "C" fn fipa_begin_actions(
     operation: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(operation, "the handle")?;
+        // SAFETY: The caller promises it.
+        let operation = unsafe { Place::of(operation, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let robot = AgentId::new(unsafe { robot.required("the robot") }?).or_fail()?;
@@ -248,9 +231,7 @@ pub unsafe extern "C" fn fipa_begin_actions(
             Ok(())
         });
         let began = OperationHandle::of(own.items.follow(tag, events));
-        // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(operation, began))
     })
 }
 
@@ -274,7 +255,8 @@ pub unsafe extern "C" fn fipa_begin_goal(
     operation: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(operation, "the handle")?;
+        // SAFETY: The caller promises it.
+        let operation = unsafe { Place::of(operation, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let robot = AgentId::new(unsafe { robot.required("the robot") }?).or_fail()?;
@@ -330,9 +312,7 @@ pub unsafe extern "C" fn fipa_begin_goal(
             Ok(())
         });
         let began = OperationHandle::cancellable(own.items.follow(tag, events), cancel);
-        // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(operation, began))
     })
 }
 

@@ -1,20 +1,19 @@
 //! Agents: registering, sending, loans, receiving.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use fipa::blocking::Wait;
 use fipa::error::{DeregisterError, SendError};
 use fipa::{Agent, Deliveries, Incoming, Loan, MessageBuilder, RegisterOptions};
 use futures_util::stream::unfold;
-use parking_lot::Mutex;
 
 use crate::domain::Membership;
 use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::item::{Event, FipaEvent, Items, OperationHandle, Text};
 use crate::letter::{FipaMessage, Letter};
+use crate::loaned::Loaned;
 use crate::message::Draft;
-use crate::raw::{Extensible, FipaText, Readable, limit, put, structure, writable};
+use crate::raw::{Extensible, FipaText, Place, Readable, limit, structure};
 use crate::table::{self, FipaHandle, Object};
 
 /// Length of a content in bytes from which it is copied into memory that the receivers read in place.
@@ -66,7 +65,8 @@ pub unsafe extern "C" fn fipa_register(
     agent: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(agent, "the handle")?;
+        // SAFETY: The caller promises it.
+        let agent = unsafe { Place::of(agent, "the handle") }?;
         let membership = table::get::<Membership>(domain)?;
         // SAFETY: The caller promises it.
         let name = unsafe { name.required("the name") }?;
@@ -86,9 +86,7 @@ pub unsafe extern "C" fn fipa_register(
             agent: registered.or_fail()?,
             items: membership.items.clone(),
         };
-        // SAFETY: The caller promises it.
-        unsafe { put(agent, table::add(Arc::new(own)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(agent, own))
     })
 }
 
@@ -124,29 +122,11 @@ fn send_loan(agent: &Agent, loan: Loan, within: Option<Duration>) -> Sending {
     }
 }
 
-/// Checks the pointer to the outcomes before a letter is sent.
-fn checked(outcomes: *mut FipaHandle) -> Result<(), Failure> {
-    match outcomes.is_null() {
-        true => Ok(()),
-        false => writable(outcomes, "the outcomes"),
-    }
-}
-
 /// Waits for the outcomes, and writes them for the caller.
-///
-/// # Safety
-/// `outcomes` is NULL or can be written.
-unsafe fn settle(sending: Sending, outcomes: *mut FipaHandle) -> Result<FipaResult, Failure> {
+fn settle(sending: Sending, outcomes: Option<Place<FipaHandle>>) -> Result<FipaResult, Failure> {
     let deliveries = sending.wait().or_fail()?;
-    if !outcomes.is_null() {
-        // SAFETY: The caller promises it.
-        unsafe {
-            put(
-                outcomes,
-                table::add(Arc::new(Text::json(&deliveries)?)),
-                "the outcomes",
-            )
-        }?;
+    if let Some(outcomes) = outcomes {
+        table::give(outcomes, Text::json(&deliveries)?);
     }
     all_delivered(&deliveries).map(|()| FipaResult::Ok)
 }
@@ -187,14 +167,14 @@ pub unsafe extern "C" fn fipa_send(
     outcomes: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        checked(outcomes)?;
+        // SAFETY: The caller promises it.
+        let outcomes = unsafe { Place::optional(outcomes, "the outcomes") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let draft = unsafe { Draft::read(message) }?;
         let builder = own.agent.message(draft.performative(None)?);
         let sending = send(&own.agent, &draft, builder, limit(timeout_ms))?;
-        // SAFETY: The caller promises it.
-        unsafe { settle(sending, outcomes) }
+        settle(sending, outcomes)
     })
 }
 
@@ -234,36 +214,21 @@ pub unsafe extern "C" fn fipa_answer(
     outcomes: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        checked(outcomes)?;
+        // SAFETY: The caller promises it.
+        let outcomes = unsafe { Place::optional(outcomes, "the outcomes") }?;
         let own = table::get::<OwnAgent>(agent)?;
-        let object = table::any(letter)?;
-        let letter = object
-            .letter()
-            .ok_or_else(|| table::other_kind(letter, "Letter"))?;
         // SAFETY: The caller promises it.
         let draft = unsafe { Draft::read(message) }?;
-        let builder = own.agent.reply(letter.message(), draft.performative(None)?);
+        let act = draft.performative(None)?;
+        let builder =
+            table::with_letter(letter, |letter| Ok(own.agent.reply(letter.message(), act)))?;
         let sending = send(&own.agent, &draft, builder, limit(timeout_ms))?;
-        // SAFETY: The caller promises it.
-        unsafe { settle(sending, outcomes) }
+        settle(sending, outcomes)
     })
 }
 
 /// A loan that the caller writes and sends.
-pub(crate) struct OpenLoan {
-    agent: Agent,
-    items: Items,
-    loan: Mutex<Option<Loan>>,
-}
-
-impl Object for OpenLoan {}
-
-impl OpenLoan {
-    fn take(&self) -> Result<Loan, Failure> {
-        let loan = self.loan.lock().take();
-        loan.ok_or_else(|| Failure::new(FipaResult::BadHandle, "the loan was sent"))
-    }
-}
+type OpenLoan = Loaned<OwnAgent, Loan>;
 
 /// Loans memory of `len` bytes for the content of a message, in shared memory where possible: receivers on this host
 /// read in place what the caller writes. The content of `message` is ignored. The memory is valid until the loan is
@@ -280,24 +245,19 @@ pub unsafe extern "C" fn fipa_loan(
     content: *mut *mut u8,
 ) -> FipaResult {
     call(|| {
-        writable(loan, "the handle")?;
-        writable(content, "the content")?;
+        // SAFETY: The caller promises it.
+        let loan = unsafe { Place::of(loan, "the handle") }?;
+        // SAFETY: The caller promises it.
+        let content = unsafe { Place::of(content, "the content") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let draft = unsafe { Draft::read(message) }?;
         let builder = draft.complete(own.agent.message(draft.performative(None)?))?;
         let mut loaned = own.agent.loan(builder, len).or_fail()?;
         let memory = loaned.content_mut().as_mut_ptr();
-        let open = OpenLoan {
-            agent: own.agent.clone(),
-            items: own.items.clone(),
-            loan: Mutex::new(Some(loaned)),
-        };
-        // SAFETY: The caller promises it.
-        unsafe { put(content, memory, "the content") }?;
-        // SAFETY: The caller promises it.
-        unsafe { put(loan, table::add(Arc::new(open)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        let open = OpenLoan::new(own, loaned);
+        content.put(memory);
+        Ok(table::give(loan, open))
     })
 }
 
@@ -312,13 +272,11 @@ pub unsafe extern "C" fn fipa_send_loan(
     outcomes: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        checked(outcomes)?;
-        let open = table::get::<OpenLoan>(loan)?;
-        let taken = open.take()?;
-        drop(table::remove(loan));
-        let sending = send_loan(&open.agent, taken, limit(timeout_ms));
         // SAFETY: The caller promises it.
-        unsafe { settle(sending, outcomes) }
+        let outcomes = unsafe { Place::optional(outcomes, "the outcomes") }?;
+        let (own, taken) = OpenLoan::take(loan)?;
+        let sending = send_loan(&own.agent, taken, limit(timeout_ms));
+        settle(sending, outcomes)
     })
 }
 
@@ -326,11 +284,9 @@ pub unsafe extern "C" fn fipa_send_loan(
 #[unsafe(no_mangle)]
 pub extern "C" fn fipa_begin_send_loan(loan: FipaHandle, timeout_ms: i64, tag: u64) -> FipaResult {
     call(|| {
-        let open = table::get::<OpenLoan>(loan)?;
-        let taken = open.take()?;
-        drop(table::remove(loan));
-        let sending = send_loan(&open.agent, taken, limit(timeout_ms));
-        open.items.begin(tag, outcomes_of(sending));
+        let (own, taken) = OpenLoan::take(loan)?;
+        let sending = send_loan(&own.agent, taken, limit(timeout_ms));
+        own.items.begin(tag, outcomes_of(sending));
         Ok(FipaResult::Ok)
     })
 }
@@ -347,7 +303,8 @@ pub unsafe extern "C" fn fipa_receive(
     letter: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(letter, "the handle")?;
+        // SAFETY: The caller promises it.
+        let letter = unsafe { Place::of(letter, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         let received: Option<Incoming> = match limit(timeout_ms) {
             Some(Duration::ZERO) => own.agent.try_receive().or_fail()?,
@@ -362,15 +319,7 @@ pub unsafe extern "C" fn fipa_receive(
         let Some(received) = received else {
             return Ok(FipaResult::Empty);
         };
-        // SAFETY: The caller promises it.
-        unsafe {
-            put(
-                letter,
-                table::add(Arc::new(Letter::from(received))),
-                "the handle",
-            )
-        }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(letter, Letter::from(received)))
     })
 }
 
@@ -386,7 +335,8 @@ pub unsafe extern "C" fn fipa_listen(
     operation: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(operation, "the handle")?;
+        // SAFETY: The caller promises it.
+        let operation = unsafe { Place::of(operation, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         let letters = unfold(Some(own.agent.clone()), |agent| async move {
             let agent = agent?;
@@ -399,8 +349,6 @@ pub unsafe extern "C" fn fipa_listen(
             }
         });
         let began = OperationHandle::of(own.items.follow(tag, letters));
-        // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(operation, began))
     })
 }

@@ -1,7 +1,5 @@
 //! Coalitions with a leader: the founder and the members.
 
-use std::sync::Arc;
-
 use fipa::blocking::Wait;
 use fipa::coalitions::{CoalitionOptions, CoalitionState, LedCoalition, Membership};
 use fipa::{Message, MessageBuilder};
@@ -12,7 +10,7 @@ use crate::agent::OwnAgent;
 use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::item::{Event, FipaEvent, OperationHandle, Text};
 use crate::locks::{FipaOwnOptions, own_options};
-use crate::raw::{FipaText, put, texts, writable};
+use crate::raw::{FipaText, Place, texts};
 use crate::table::{self, FipaHandle, Object};
 
 /// A coalition that an agent has founded.
@@ -28,8 +26,7 @@ impl Object for FoundedCoalition {}
 
 impl Object for CoalitionMember {
     fn close(&self) -> Result<(), Failure> {
-        self.operation.end();
-        Ok(())
+        self.operation.close()
     }
 
     fn guard(&self, message: MessageBuilder) -> Option<Result<MessageBuilder, Failure>> {
@@ -57,7 +54,8 @@ pub unsafe extern "C" fn fipa_found_coalition(
     coalition: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(coalition, "the handle")?;
+        // SAFETY: The caller promises it.
+        let coalition = unsafe { Place::of(coalition, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let name = unsafe { name.required("the name") }?;
@@ -71,15 +69,7 @@ pub unsafe extern "C" fn fipa_found_coalition(
         let founded = own.agent.found_coalition(name, members, options).wait();
         let founded =
             founded.map_err(|error| Failure::new(FipaResult::Failed, error.to_string()))?;
-        // SAFETY: The caller promises it.
-        unsafe {
-            put(
-                coalition,
-                table::add(Arc::new(FoundedCoalition(founded))),
-                "the handle",
-            )
-        }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(coalition, FoundedCoalition(founded)))
     })
 }
 
@@ -118,7 +108,8 @@ pub unsafe extern "C" fn fipa_join_coalition(
     member: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(member, "the handle")?;
+        // SAFETY: The caller promises it.
+        let member = unsafe { Place::of(member, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let name = unsafe { name.required("the name") }?;
@@ -134,9 +125,7 @@ pub unsafe extern "C" fn fipa_join_coalition(
             membership,
             operation: OperationHandle::of(own.items.follow(tag, changes)),
         };
-        // SAFETY: The caller promises it.
-        unsafe { put(member, table::add(Arc::new(joined)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(member, joined))
     })
 }
 

@@ -13,7 +13,7 @@ use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::item::{Event, FipaEvent, Items, OperationHandle, Text, script};
 use crate::letter::{FipaMessage, Letter};
 use crate::message::Draft;
-use crate::raw::{FipaBytes, LONG, elements, limit, put, writable};
+use crate::raw::{FipaBytes, LONG, Place, elements, limit};
 use crate::table::{self, FipaHandle, Object};
 
 /// Time for the proposals if the caller sets none.
@@ -70,7 +70,8 @@ pub unsafe extern "C" fn fipa_begin_call(
     operation: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(operation, "the handle")?;
+        // SAFETY: The caller promises it.
+        let operation = unsafe { Place::of(operation, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let draft = unsafe { Draft::read(message) }?;
@@ -90,9 +91,7 @@ pub unsafe extern "C" fn fipa_begin_call(
             Ok(())
         });
         let began = OperationHandle::of(own.items.follow(tag, events));
-        // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(operation, began))
     })
 }
 
@@ -108,7 +107,8 @@ pub unsafe extern "C" fn fipa_read_bid(
     letter: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(letter, "the handle")?;
+        // SAFETY: The caller promises it.
+        let letter = unsafe { Place::of(letter, "the handle") }?;
         let open = table::get::<OpenCall>(bids)?;
         let proposal = open.proposals.get(index).cloned();
         let proposal = proposal.ok_or_else(|| {
@@ -117,15 +117,7 @@ pub unsafe extern "C" fn fipa_read_bid(
                 "there is no proposal {index}: the call has {number}"
             ))
         })?;
-        // SAFETY: The caller promises it.
-        unsafe {
-            put(
-                letter,
-                table::add(Arc::new(Letter::from(proposal))),
-                "the handle",
-            )
-        }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(letter, Letter::from(proposal)))
     })
 }
 

@@ -5,17 +5,16 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use fipa::blocking::Wait;
-use fipa::protocol::{DialogueError, Reply, Request, Server, Task};
+use fipa::protocol::{DialogueError, Reply, Request, Task};
 use fipa::{Agent, MessageBuilder, Performative};
-use futures_util::stream::unfold;
 use tokio::sync::{Notify, mpsc, oneshot};
 
 use crate::agent::OwnAgent;
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, FipaEvent, GivenHandle, Items, OperationHandle, script};
+use crate::item::{Event, FipaEvent, Following, GivenHandle, Items, OperationHandle, script};
 use crate::letter::{FipaMessage, Letter};
 use crate::message::Draft;
-use crate::raw::{FipaBytes, FipaText, LONG, limit, put, writable};
+use crate::raw::{FipaBytes, FipaText, LONG, Place, limit};
 use crate::table::{self, FipaHandle, Object};
 
 /// Time for the answer to a cancel.
@@ -63,7 +62,8 @@ pub unsafe extern "C" fn fipa_request(
     answer: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(answer, "the handle")?;
+        // SAFETY: The caller promises it.
+        let answer = unsafe { Place::of(answer, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let (message, is_query) = unsafe { opening(&own, message) }?;
@@ -73,9 +73,7 @@ pub unsafe extern "C" fn fipa_request(
             request.result().await
         };
         let result = Letter::from(result.wait().or_fail()?);
-        // SAFETY: The caller promises it.
-        unsafe { put(answer, table::add(Arc::new(result)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(answer, result))
     })
 }
 
@@ -94,7 +92,8 @@ pub unsafe extern "C" fn fipa_begin_request(
     operation: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(operation, "the handle")?;
+        // SAFETY: The caller promises it.
+        let operation = unsafe { Place::of(operation, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let (message, is_query) = unsafe { opening(&own, message) }?;
@@ -125,9 +124,7 @@ pub unsafe extern "C" fn fipa_begin_request(
             Ok(())
         });
         let began = OperationHandle::cancellable(own.items.follow(tag, events), cancel);
-        // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(operation, began))
     })
 }
 
@@ -154,22 +151,9 @@ enum Command {
     Last(Reply),
 }
 
-/// A running server.
-struct OpenServer {
-    _server: Server,
-    operation: OperationHandle,
-}
-
 impl Object for OpenTask {
     fn letter(&self) -> Option<&Letter> {
         Some(&self.first)
-    }
-}
-
-impl Object for OpenServer {
-    fn close(&self) -> Result<(), Failure> {
-        self.operation.end();
-        Ok(())
     }
 }
 
@@ -187,7 +171,8 @@ pub unsafe extern "C" fn fipa_serve(
     server: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(server, "the handle")?;
+        // SAFETY: The caller promises it.
+        let server = unsafe { Place::of(server, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let protocol = unsafe { protocol.required("the protocol") }?;
@@ -199,17 +184,9 @@ pub unsafe extern "C" fn fipa_serve(
                 handle(task, events.clone(), items.clone())
             })
         };
-        let received = unfold(received, |mut received| async move {
-            let event = received.recv().await?;
-            Some((event, received))
-        });
-        let open = OpenServer {
-            _server: served.wait().or_fail()?,
-            operation: OperationHandle::of(own.items.follow(tag, received)),
-        };
-        // SAFETY: The caller promises it.
-        unsafe { put(server, table::add(Arc::new(open)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        let served = served.wait().or_fail()?;
+        let open = Following::new(&own.items, tag, served, received);
+        Ok(table::give(server, open))
     })
 }
 

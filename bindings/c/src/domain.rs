@@ -1,17 +1,15 @@
 //! Domains: joining, the directory, and the routes.
 
-use std::path::PathBuf;
-use std::sync::Arc;
-
 use fipa::blocking::{self, Wait};
 use fipa::config::Sources;
 use fipa::{Change, Config, Domain, Matcher, Query};
 use futures_util::StreamExt as _;
 use serde_json::{Value, json};
+use std::path::PathBuf;
 
 use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::item::{Event, FipaEvent, Items, OperationHandle, Text};
-use crate::raw::{Extensible, FipaText, Readable, put, structure, texts, writable};
+use crate::raw::{Extensible, FipaText, Place, Readable, structure, texts};
 use crate::table::{self, FipaHandle, Object};
 
 /// How a process joins a domain. A field that is zero is not set.
@@ -57,7 +55,8 @@ pub unsafe extern "C" fn fipa_open(
     domain: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(domain, "the handle")?;
+        // SAFETY: The caller promises it.
+        let domain = unsafe { Place::of(domain, "the handle") }?;
         // SAFETY: The caller promises it.
         let (sources, config) = unsafe { configured(options) }?;
         blocking::start().or_fail()?;
@@ -67,9 +66,7 @@ pub unsafe extern "C" fn fipa_open(
             domain: opened,
             items: Items::new(),
         };
-        // SAFETY: The caller promises it.
-        unsafe { put(domain, table::add(Arc::new(membership)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(domain, membership))
     })
 }
 
@@ -113,7 +110,8 @@ pub unsafe extern "C" fn fipa_agents(
     agents: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(agents, "the handle")?;
+        // SAFETY: The caller promises it.
+        let agents = unsafe { Place::of(agents, "the handle") }?;
         let membership = table::get::<Membership>(domain)?;
         let query = Query {
             // SAFETY: The caller promises it.
@@ -124,15 +122,7 @@ pub unsafe extern "C" fn fipa_agents(
         };
         let mut found = membership.domain.agents();
         found.retain(|entry| query.matches(entry));
-        // SAFETY: The caller promises it.
-        unsafe {
-            put(
-                agents,
-                table::add(Arc::new(Text::json(&found)?)),
-                "the handle",
-            )
-        }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(agents, Text::json(&found)?))
     })
 }
 
@@ -152,7 +142,8 @@ pub unsafe extern "C" fn fipa_routes(
     routes: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(routes, "the handle")?;
+        // SAFETY: The caller promises it.
+        let routes = unsafe { Place::of(routes, "the handle") }?;
         let membership = table::get::<Membership>(domain)?;
         let query = Query {
             // SAFETY: The caller promises it.
@@ -160,15 +151,7 @@ pub unsafe extern "C" fn fipa_routes(
             ..Query::all()
         };
         let report = membership.domain.routes(&query);
-        // SAFETY: The caller promises it.
-        unsafe {
-            put(
-                routes,
-                table::add(Arc::new(Text::json(&report)?)),
-                "the handle",
-            )
-        }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(routes, Text::json(&report)?))
     })
 }
 
@@ -185,7 +168,8 @@ pub unsafe extern "C" fn fipa_follow_agents(
     operation: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(operation, "the handle")?;
+        // SAFETY: The caller promises it.
+        let operation = unsafe { Place::of(operation, "the handle") }?;
         let membership = table::get::<Membership>(domain)?;
         let changes = membership.domain.changes().flat_map(|change| {
             let mut all = Vec::new();
@@ -197,9 +181,7 @@ pub unsafe extern "C" fn fipa_follow_agents(
             futures_util::stream::iter(events.collect::<Vec<_>>())
         });
         let began = OperationHandle::of(membership.items.follow(tag, changes));
-        // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(operation, began))
     })
 }
 

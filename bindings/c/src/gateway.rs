@@ -1,14 +1,12 @@
 //! A gateway in the process of the program.
 
-use std::sync::Arc;
-
 use fipa::Gateway;
 use fipa::blocking::{self, Wait};
 use parking_lot::Mutex;
 
 use crate::domain::{FipaDomainOptions, configured};
 use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::raw::{put, writable};
+use crate::raw::Place;
 use crate::table::{self, FipaHandle, Object};
 
 /// A running gateway, until the caller closes it.
@@ -34,14 +32,13 @@ pub unsafe extern "C" fn fipa_open_gateway(
     gateway: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(gateway, "the handle")?;
+        // SAFETY: The caller promises it.
+        let gateway = unsafe { Place::of(gateway, "the handle") }?;
         // SAFETY: The caller promises it.
         let (_, config) = unsafe { configured(options) }?;
         blocking::start().or_fail()?;
         let opened = Gateway::open(&config).wait().or_fail()?;
         let open = OpenGateway(Mutex::new(Some(opened)));
-        // SAFETY: The caller promises it.
-        unsafe { put(gateway, table::add(Arc::new(open)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(gateway, open))
     })
 }

@@ -5,7 +5,7 @@ use std::os::fd::AsRawFd as _;
 use crate::domain::Membership;
 use crate::failure::{FipaResult, OrFail, call};
 use crate::item::{FipaItem, OperationHandle};
-use crate::raw::{FipaText, fill, fillable, limit, put};
+use crate::raw::{FipaText, Place, fill, fillable, limit};
 use crate::table::{self, FipaHandle};
 
 /// Takes the next item of a domain; waits for it up to `timeout_ms`, or without a limit if that is negative. Returns
@@ -42,10 +42,11 @@ pub unsafe extern "C" fn fipa_next(
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn fipa_fd(domain: FipaHandle, fd: *mut i32) -> FipaResult {
     call(|| {
+        // SAFETY: The caller promises it.
+        let fd = unsafe { Place::of(fd, "the fd") }?;
         let membership = table::get::<Membership>(domain)?;
         let descriptor = membership.items.descriptor().or_fail()?.as_raw_fd();
-        // SAFETY: The caller promises it.
-        unsafe { put(fd, descriptor, "the fd") }?;
+        fd.put(descriptor);
         Ok(FipaResult::Ok)
     })
 }
@@ -68,12 +69,13 @@ pub extern "C" fn fipa_cancel(operation: FipaHandle) -> FipaResult {
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn fipa_read_text(handle: FipaHandle, text: *mut FipaText) -> FipaResult {
     call(|| {
+        // SAFETY: The caller promises it.
+        let text = unsafe { Place::of(text, "the text") }?;
         let object = table::any(handle)?;
         let own = object
             .text()
             .ok_or_else(|| table::other_kind(handle, "Text"))?;
-        // SAFETY: The caller promises it.
-        unsafe { put(text, FipaText::of(own), "the text") }?;
+        text.put(FipaText::of(own));
         Ok(FipaResult::Ok)
     })
 }

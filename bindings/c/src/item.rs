@@ -14,7 +14,7 @@ use crate::table::{self, FipaHandle, Object};
 
 pub(crate) type Items = Queue<Event>;
 
-/// What an item is, and what its handle refers to.
+/// The kind of an item, which says what its handle refers to.
 #[repr(i32)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FipaEvent {
@@ -70,7 +70,7 @@ pub struct FipaItem {
     pub size: usize,
     /// The tag with which the operation was begun.
     pub tag: u64,
-    /// What the item is.
+    /// The kind.
     pub kind: FipaEvent,
     /// Zero, or the failure of the operation. `fipa_error` has its text until the next failure of this thread.
     pub result: FipaResult,
@@ -250,10 +250,6 @@ impl OperationHandle {
         Self { operation, cancel }
     }
 
-    pub(crate) fn end(&self) {
-        self.operation.abandon();
-    }
-
     /// Asks the operation to cancel its conversation.
     pub(crate) fn cancel(&self) {
         self.cancel.notify_one();
@@ -262,7 +258,35 @@ impl OperationHandle {
 
 impl Object for OperationHandle {
     fn close(&self) -> Result<(), Failure> {
-        self.end();
+        self.operation.abandon();
         Ok(())
+    }
+}
+
+/// Something that begins operations of other agents, such as a server, with its events.
+pub(crate) struct Following<T> {
+    _kept: T,
+    operation: OperationHandle,
+}
+
+impl<T: Send + Sync + 'static> Following<T> {
+    /// Makes each event of `events` an item of the tag.
+    pub(crate) fn new(
+        items: &Items,
+        tag: u64,
+        kept: T,
+        mut events: mpsc::UnboundedReceiver<Event>,
+    ) -> Self {
+        let events = poll_fn(move |context| events.poll_recv(context));
+        Self {
+            _kept: kept,
+            operation: OperationHandle::of(items.follow(tag, events)),
+        }
+    }
+}
+
+impl<T: Send + Sync + 'static> Object for Following<T> {
+    fn close(&self) -> Result<(), Failure> {
+        self.operation.close()
     }
 }

@@ -21,8 +21,8 @@ pub struct FipaParameter {
 
 /// The parameters of a message (FIPA00061). A parameter that is zero is not set.
 ///
-/// What a call reads from this structure is not used after the call. What `fipa_read_message` writes into it belongs
-/// to the letter, and is valid until the handle of the letter is closed.
+/// A call does not use the structure, or anything that it points to, after the call. The texts and bytes that
+/// `fipa_read_message` writes into it belong to the letter, and are valid until the handle of the letter is closed.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct FipaMessage {

@@ -13,6 +13,7 @@ mod gateway;
 mod handles;
 mod item;
 mod letter;
+mod loaned;
 mod locks;
 mod message;
 mod raw;
@@ -33,7 +34,7 @@ pub use crate::item::{FipaEvent, FipaItem};
 pub use crate::letter::{FipaLetterInfo, FipaMessage, FipaParameter};
 pub use crate::locks::*;
 pub use crate::message::*;
-pub use crate::raw::{FipaBytes, FipaText};
+pub use crate::raw::FipaText;
 pub use crate::table::FipaHandle;
 pub use crate::topics::*;
 

@@ -1,7 +1,6 @@
 //! Locks of resources, and their owners.
 
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::Duration;
 
 use fipa::blocking::Wait;
@@ -11,7 +10,7 @@ use fipa::{Agent, Message, MessageBuilder};
 use crate::agent::OwnAgent;
 use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::item::{Event, FipaEvent, OperationHandle, script};
-use crate::raw::{Extensible, FipaText, Readable, fill, limit, put, structure, texts, writable};
+use crate::raw::{Extensible, FipaText, Place, Readable, fill, limit, structure, texts};
 use crate::table::{self, FipaHandle, Object};
 
 /// A lock that the caller holds.
@@ -47,15 +46,14 @@ pub unsafe extern "C" fn fipa_lock(
     lock: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(lock, "the handle")?;
+        // SAFETY: The caller promises it.
+        let lock = unsafe { Place::of(lock, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let resources = unsafe { named(resources, resource_count) }?;
         let acquired = acquire(&own.agent, &resources, limit(timeout_ms)).wait();
         let held = HeldLock::new(acquired.or_fail()?);
-        // SAFETY: The caller promises it.
-        unsafe { put(lock, table::add(Arc::new(held)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(lock, held))
     })
 }
 
@@ -100,7 +98,8 @@ pub unsafe extern "C" fn fipa_begin_lock(
     operation: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(operation, "the handle")?;
+        // SAFETY: The caller promises it.
+        let operation = unsafe { Place::of(operation, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let resources = unsafe { named(resources, resource_count) }?;
@@ -116,9 +115,7 @@ pub unsafe extern "C" fn fipa_begin_lock(
             Err(Failure::of(lost.await))
         });
         let began = OperationHandle::of(own.items.follow(tag, events));
-        // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(operation, began))
     })
 }
 
@@ -205,16 +202,15 @@ pub unsafe extern "C" fn fipa_own(
     owned: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(owned, "the handle")?;
+        // SAFETY: The caller promises it.
+        let owned = unsafe { Place::of(owned, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let resource = unsafe { resource.required("the resource") }?;
         // SAFETY: The caller promises it.
         let options = unsafe { own_options(options) }?;
         let open = OpenOwned(own.agent.own(resource, options).wait().or_fail()?);
-        // SAFETY: The caller promises it.
-        unsafe { put(owned, table::add(Arc::new(open)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(owned, open))
     })
 }
 
@@ -246,11 +242,11 @@ pub(crate) unsafe fn own_options(options: *const FipaOwnOptions) -> Result<OwnOp
 #[unsafe(no_mangle)]
 pub extern "C" fn fipa_check_fence(guard: FipaHandle, letter: FipaHandle) -> FipaResult {
     call(|| {
-        let (object, of_letter) = (table::any(guard)?, table::any(letter)?);
-        let own = of_letter.letter();
-        let own = own.ok_or_else(|| table::other_kind(letter, "Letter"))?;
-        let checked = object.check(own.message());
-        checked.ok_or_else(|| table::other_kind(guard, "OpenOwned"))??;
-        Ok(FipaResult::Ok)
+        let object = table::any(guard)?;
+        table::with_letter(letter, |letter| {
+            let checked = object.check(letter.message());
+            checked.ok_or_else(|| table::other_kind(guard, "OpenOwned"))??;
+            Ok(FipaResult::Ok)
+        })
     })
 }

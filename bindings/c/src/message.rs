@@ -7,7 +7,7 @@ use fipa::{MessageBuilder, Performative, Time};
 
 use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::letter::{FipaLetterInfo, FipaMessage, FipaParameter};
-use crate::raw::{self, FipaBytes, FipaText, elements, fill, put, texts};
+use crate::raw::{self, FipaBytes, FipaText, Place, elements, fill, texts};
 use crate::table::{self, FipaHandle};
 
 /// The message of a caller, before its sender is known.
@@ -140,13 +140,11 @@ pub unsafe extern "C" fn fipa_read_message(
     message: *mut FipaMessage,
 ) -> FipaResult {
     call(|| {
-        let object = table::any(letter)?;
-        let letter = object
-            .letter()
-            .ok_or_else(|| table::other_kind(letter, "Letter"))?;
-        // SAFETY: The caller promises it.
-        unsafe { fill(message, letter.parameters(), "the message") }?;
-        Ok(FipaResult::Ok)
+        table::with_letter(letter, |letter| {
+            // SAFETY: The caller promises it.
+            unsafe { fill(message, letter.parameters(), "the message") }?;
+            Ok(FipaResult::Ok)
+        })
     })
 }
 
@@ -161,13 +159,12 @@ pub unsafe extern "C" fn fipa_read_content(
     content: *mut FipaBytes,
 ) -> FipaResult {
     call(|| {
-        let object = table::any(letter)?;
-        let letter = object
-            .letter()
-            .ok_or_else(|| table::other_kind(letter, "Letter"))?;
         // SAFETY: The caller promises it.
-        unsafe { put(content, letter.content(), "the content") }?;
-        Ok(FipaResult::Ok)
+        let content = unsafe { Place::of(content, "the content") }?;
+        table::with_letter(letter, |letter| {
+            content.put(letter.content());
+            Ok(FipaResult::Ok)
+        })
     })
 }
 
@@ -181,12 +178,10 @@ pub unsafe extern "C" fn fipa_read_info(
     info: *mut FipaLetterInfo,
 ) -> FipaResult {
     call(|| {
-        let object = table::any(letter)?;
-        let letter = object
-            .letter()
-            .ok_or_else(|| table::other_kind(letter, "Letter"))?;
-        // SAFETY: The caller promises it.
-        unsafe { fill(info, letter.info(), "the info") }?;
-        Ok(FipaResult::Ok)
+        table::with_letter(letter, |letter| {
+            // SAFETY: The caller promises it.
+            unsafe { fill(info, letter.info(), "the info") }?;
+            Ok(FipaResult::Ok)
+        })
     })
 }

@@ -222,8 +222,9 @@ pub(crate) unsafe fn fill<T: Extensible>(at: *mut T, value: T, what: &str) -> Re
 /// # Safety
 /// Unless the pointer is NULL, a `usize` must be readable there.
 pub(crate) unsafe fn fillable<T: Extensible>(at: *mut T, what: &str) -> Result<usize, Failure> {
-    writable(at, what)?;
-    // SAFETY: The pointer is aligned and not NULL, and the caller promises that the size is there.
+    // SAFETY: Only the size is read, which the caller promises to be there.
+    let Place(at) = unsafe { Place::of(at, what) }?;
+    // SAFETY: The pointer is aligned, and the caller promises that the size is there.
     let size = unsafe { at.cast::<usize>().read() };
     check_size::<T>(size, what)?;
     Ok(size)
@@ -240,23 +241,38 @@ fn check_size<T>(size: usize, what: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Writes a result for the caller.
-///
-/// # Safety
-/// Unless the pointer is NULL, a `T` must be writable there.
-pub(crate) unsafe fn put<T>(at: *mut T, value: T, what: &str) -> Result<(), Failure> {
-    writable(at, what)?;
-    // SAFETY: The pointer is aligned and not NULL, and the caller promises that it is writable.
-    unsafe { at.write(value) };
-    Ok(())
-}
+/// A place of the caller for a result. It is checked before the call has an effect.
+pub(crate) struct Place<T>(NonNull<T>);
 
-/// Checks a pointer to a result before the call has an effect.
-pub(crate) fn writable<T>(at: *mut T, what: &str) -> Result<(), Failure> {
-    if at.is_null() || !at.is_aligned() {
-        return Err(Failure::invalid(format!("{what} is NULL or not aligned")));
+impl<T> Place<T> {
+    /// Checks a pointer; `what` names it in errors.
+    ///
+    /// # Safety
+    /// Unless the pointer is NULL, a `T` must be writable there until the call returns.
+    pub(crate) unsafe fn of(at: *mut T, what: &str) -> Result<Self, Failure> {
+        let place = NonNull::new(at).filter(|at| at.is_aligned());
+        place
+            .map(Self)
+            .ok_or_else(|| Failure::invalid(format!("{what} is NULL or not aligned")))
     }
-    Ok(())
+
+    /// As [`of`](Self::of), for a result that the caller need not ask for: `None` if the pointer is NULL.
+    ///
+    /// # Safety
+    /// As for [`of`](Self::of).
+    pub(crate) unsafe fn optional(at: *mut T, what: &str) -> Result<Option<Self>, Failure> {
+        match at.is_null() {
+            true => Ok(None),
+            // SAFETY: The caller promises it.
+            false => unsafe { Self::of(at, what) }.map(Some),
+        }
+    }
+
+    /// Writes the result.
+    pub(crate) fn put(self, value: T) {
+        // SAFETY: The pointer is aligned, and the caller of `of` has promised that it is writable.
+        unsafe { self.0.write(value) };
+    }
 }
 
 /// Reads a time limit in milliseconds: `None` if it is negative.

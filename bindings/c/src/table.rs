@@ -9,6 +9,7 @@ use slotmap::{DefaultKey, Key as _, KeyData, SlotMap};
 
 use crate::failure::{Failure, FipaResult};
 use crate::letter::Letter;
+use crate::raw::Place;
 
 /// A handle: an index with a generation. Zero is no handle. A handle that was closed is never given out again before
 /// 2^31 others in its place.
@@ -54,6 +55,22 @@ static TABLE: LazyLock<RwLock<SlotMap<DefaultKey, Arc<dyn Object>>>> =
 /// Stores an object, and returns its handle.
 pub(crate) fn add(object: Arc<dyn Object>) -> FipaHandle {
     TABLE.write().insert(object).data().as_ffi()
+}
+
+/// Stores an object, and writes its handle for the caller.
+pub(crate) fn give(place: Place<FipaHandle>, object: impl Object) -> FipaResult {
+    place.put(add(Arc::new(object)));
+    FipaResult::Ok
+}
+
+/// Calls a function with the letter of a handle.
+pub(crate) fn with_letter<T>(
+    handle: FipaHandle,
+    read: impl FnOnce(&Letter) -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    let object = any(handle)?;
+    let letter = object.letter();
+    read(letter.ok_or_else(|| other_kind(handle, "Letter"))?)
 }
 
 /// Returns the object of a handle.

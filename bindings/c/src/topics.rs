@@ -1,21 +1,20 @@
 //! Topics: publishing and subscribing.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use fipa::Performative;
 use fipa::blocking::Wait;
 use fipa::protocol::Keep;
 use fipa::topics::{Publisher, Topic, TopicLoan};
-use parking_lot::Mutex;
 
 use crate::agent::OwnAgent;
 use crate::conversation::copied;
 use crate::failure::{Failure, FipaResult, OrFail, call};
 use crate::item::{Event, FipaEvent, OperationHandle, script};
 use crate::letter::{FipaMessage, Letter};
+use crate::loaned::Loaned;
 use crate::message::Draft;
-use crate::raw::{Extensible, FipaBytes, FipaText, Readable, limit, put, structure, writable};
+use crate::raw::{Extensible, FipaBytes, FipaText, Place, Readable, limit, structure};
 use crate::table::{self, FipaHandle, Object};
 
 /// Time for the answer to a subscription, if the caller sets none.
@@ -47,14 +46,9 @@ unsafe impl Readable for FipaTopic {}
 struct OpenPublisher(Publisher);
 
 /// A loan of a publisher.
-struct OpenTopicLoan {
-    publisher: Arc<OpenPublisher>,
-    loan: Mutex<Option<TopicLoan>>,
-}
+type OpenTopicLoan = Loaned<OpenPublisher, TopicLoan>;
 
 impl Object for OpenPublisher {}
-
-impl Object for OpenTopicLoan {}
 
 /// Publishes a topic: accepts the subscriptions whose content is its name (FIPA00035). `fipa_close` ends it.
 ///
@@ -67,7 +61,8 @@ pub unsafe extern "C" fn fipa_publisher(
     publisher: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(publisher, "the handle")?;
+        // SAFETY: The caller promises it.
+        let publisher = unsafe { Place::of(publisher, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let topic = unsafe { structure(topic, "the topic") }?;
@@ -88,15 +83,7 @@ pub unsafe extern "C" fn fipa_publisher(
         }
         described = described.latched(topic.latched);
         let opened = async { own.agent.publisher(described) }.wait().or_fail()?;
-        // SAFETY: The caller promises it.
-        unsafe {
-            put(
-                publisher,
-                table::add(Arc::new(OpenPublisher(opened))),
-                "the handle",
-            )
-        }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(publisher, OpenPublisher(opened)))
     })
 }
 
@@ -112,12 +99,15 @@ pub unsafe extern "C" fn fipa_publish(
     subscribers: *mut usize,
 ) -> FipaResult {
     call(|| {
+        // SAFETY: The caller promises it.
+        let subscribers = unsafe { Place::optional(subscribers, "the number of subscribers") }?;
         let publisher = table::get::<OpenPublisher>(publisher)?;
         // SAFETY: The caller promises it.
         let content = unsafe { copied(content) }?;
         let publication = publisher.0.publish(content).wait();
-        // SAFETY: The caller promises it.
-        unsafe { count(subscribers, publication.subscribers()) }?;
+        if let Some(subscribers) = subscribers {
+            subscribers.put(publication.subscribers());
+        }
         Ok(FipaResult::Ok)
     })
 }
@@ -135,20 +125,16 @@ pub unsafe extern "C" fn fipa_loan_notification(
     content: *mut *mut u8,
 ) -> FipaResult {
     call(|| {
-        writable(loan, "the handle")?;
-        writable(content, "the content")?;
+        // SAFETY: The caller promises it.
+        let loan = unsafe { Place::of(loan, "the handle") }?;
+        // SAFETY: The caller promises it.
+        let content = unsafe { Place::of(content, "the content") }?;
         let publisher = table::get::<OpenPublisher>(publisher)?;
         let mut loaned = publisher.0.loan(len).or_fail()?;
         let memory = loaned.content_mut().as_mut_ptr();
-        let open = OpenTopicLoan {
-            publisher,
-            loan: Mutex::new(Some(loaned)),
-        };
-        // SAFETY: The caller promises it.
-        unsafe { put(content, memory, "the content") }?;
-        // SAFETY: The caller promises it.
-        unsafe { put(loan, table::add(Arc::new(open)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        let open = OpenTopicLoan::new(publisher, loaned);
+        content.put(memory);
+        Ok(table::give(loan, open))
     })
 }
 
@@ -162,28 +148,15 @@ pub unsafe extern "C" fn fipa_publish_loan(
     subscribers: *mut usize,
 ) -> FipaResult {
     call(|| {
-        let open = table::get::<OpenTopicLoan>(loan)?;
-        let taken = open.loan.lock().take();
-        let taken =
-            taken.ok_or_else(|| Failure::new(FipaResult::BadHandle, "the loan was published"))?;
-        drop(table::remove(loan));
-        let publication = open.publisher.0.publish_loan(taken).wait();
         // SAFETY: The caller promises it.
-        unsafe { count(subscribers, publication.subscribers()) }?;
+        let subscribers = unsafe { Place::optional(subscribers, "the number of subscribers") }?;
+        let (publisher, taken) = OpenTopicLoan::take(loan)?;
+        let publication = publisher.0.publish_loan(taken).wait();
+        if let Some(subscribers) = subscribers {
+            subscribers.put(publication.subscribers());
+        }
         Ok(FipaResult::Ok)
     })
-}
-
-/// Writes a number if the caller asks for it.
-///
-/// # Safety
-/// `at` is NULL or can be written.
-unsafe fn count(at: *mut usize, number: usize) -> Result<(), Failure> {
-    if at.is_null() {
-        return Ok(());
-    }
-    // SAFETY: The caller promises it.
-    unsafe { put(at, number, "the number of subscribers") }
 }
 
 /// Subscribes to a topic: `message` has the publishing agent as its receiver and the name of the topic as its content.
@@ -204,7 +177,8 @@ pub unsafe extern "C" fn fipa_subscribe(
     operation: *mut FipaHandle,
 ) -> FipaResult {
     call(|| {
-        writable(operation, "the handle")?;
+        // SAFETY: The caller promises it.
+        let operation = unsafe { Place::of(operation, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
         let draft = unsafe { Draft::read(message) }?;
@@ -239,8 +213,6 @@ pub unsafe extern "C" fn fipa_subscribe(
             }
         });
         let began = OperationHandle::of(own.items.follow(tag, events));
-        // SAFETY: The caller promises it.
-        unsafe { put(operation, table::add(Arc::new(began)), "the handle") }?;
-        Ok(FipaResult::Ok)
+        Ok(table::give(operation, began))
     })
 }

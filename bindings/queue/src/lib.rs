@@ -36,7 +36,7 @@ struct Shared<E> {
     bell: Arc<Bell>,
 }
 
-/// What has happened to an operation.
+/// An event of an operation, with its tag.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(clippy::exhaustive_structs, reason = "callers build items in tests")]
 pub struct Item<E> {
