@@ -1,36 +1,29 @@
 //! Actions of robots: offering them, and invoking those of other robots.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use fipa::AgentId;
-use fipa::actions::{
-    Action, ActionDescription, Cause, Execution, Goal, GoalStatus, Progress, Term,
-    arguments_from_json, term_from_json, term_to_json,
-};
+use fipa::actions::{Goal, arguments_from_json};
 use fipa::blocking::Wait;
-use parking_lot::Mutex;
+use fipa_bindings::{Failure, GoalEvent, Offered, OrFail, Pursuit, action_of, invoke, offered};
+use futures_util::StreamExt as _;
 use serde::de::DeserializeOwned;
-use serde_json::{Map, Value, json};
-use tokio::sync::{Notify, mpsc, oneshot};
+use serde_json::{Map, Value};
+use tokio::sync::{Notify, mpsc};
 
 use crate::agent::OwnAgent;
-use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, FipaEvent, Following, GivenHandle, OperationHandle, Text, script};
+use crate::failure::{FipaResult, call};
+use crate::item::{Event, FipaEvent, Following, GivenHandle, OperationHandle, Text};
 use crate::locks::HeldLock;
 use crate::raw::{FipaText, Place, limit};
 use crate::table::{self, FipaHandle, Object};
-
-/// Time for the answer to a cancel.
-const CANCEL: Duration = Duration::from_secs(10);
 
 type Arguments = Map<String, Value>;
 
 /// A goal of an action that this agent offers.
 struct OpenGoal {
     arguments: Text,
-    execution: Arc<Execution>,
-    end: Mutex<Option<oneshot::Sender<Result<Term<'static>, String>>>>,
+    pursuit: Pursuit,
 }
 
 impl Object for OpenGoal {
@@ -58,14 +51,16 @@ pub unsafe extern "C" fn fipa_offer(
         let offer = unsafe { Place::of(offer, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
-        let description = described(unsafe { description.required("the description") }?)?;
+        let action = action_of(unsafe { description.required("the description") }?)?;
         // The robot admits a bounded number of goals, and each sends at most two events.
         let (events, received) = mpsc::unbounded_channel();
         let offered = async {
-            own.agent
-                .offer(Action::from(description), move |arguments, execution| {
-                    pursue(arguments, Arc::new(execution), events.clone())
+            own.agent.offer(action, move |arguments, execution| {
+                let (events, handle) = (events.clone(), GivenHandle::default());
+                offered(arguments, execution, move |event| {
+                    events.send(offered_event(event, &handle)).is_ok()
                 })
+            })
         };
         let offered = offered.wait().or_fail()?;
         let open = Following::new(&own.items, tag, offered, received);
@@ -73,73 +68,15 @@ pub unsafe extern "C" fn fipa_offer(
     })
 }
 
-/// Reads the description of an action, with defaults for what it leaves out.
-fn described(text: &str) -> Result<ActionDescription, Failure> {
-    let wrong = |error: serde_json::Error| {
-        Failure::invalid(format!("the description of the action: {error}"))
-    };
-    let mut description: Map<String, Value> = serde_json::from_str(text).map_err(wrong)?;
-    let defaults = [
-        ("parameters", json!([])),
-        ("result", json!("any")),
-        ("policy", json!("reject")),
-        ("fenced", json!(false)),
-    ];
-    for (key, default) in defaults {
-        description.entry(key).or_insert(default);
-    }
-    if let Some(Value::Array(parameters)) = description.get_mut("parameters") {
-        for parameter in parameters.iter_mut().filter_map(Value::as_object_mut) {
-            parameter.entry("optional").or_insert(json!(false));
-        }
-    }
-    serde_json::from_value(Value::Object(description)).map_err(wrong)
-}
-
-/// Hands a goal to the program, and waits until the program ends it.
-async fn pursue(
-    arguments: Arguments,
-    execution: Arc<Execution>,
-    events: mpsc::UnboundedSender<Event>,
-) -> Result<Term<'static>, String> {
-    let (end, mut ended) = oneshot::channel();
-    let handle = GivenHandle::default();
-    let arguments = Text::json(&arguments).map_err(|failure| failure.text)?;
-    let goal = OpenGoal {
-        arguments,
-        execution: Arc::clone(&execution),
-        end: Mutex::new(Some(end)),
-    };
-    let withdrawn = "the program has ended its offer";
-    let event = Event::giving(FipaEvent::Goal, goal, &handle);
-    events.send(event).map_err(|_| withdrawn)?;
-    let mut is_stopped = false;
-    loop {
-        tokio::select! {
-            result = &mut ended => {
-                return result.unwrap_or_else(|_| Err("the program has dropped the goal".to_owned()));
+fn offered_event(event: Offered, handle: &GivenHandle) -> Event {
+    match event {
+        Offered::Goal(arguments, pursuit) => match Text::json(&arguments) {
+            Ok(arguments) => {
+                Event::giving(FipaEvent::Goal, OpenGoal { arguments, pursuit }, handle)
             }
-            cause = execution.stopped(), if !is_stopped => {
-                is_stopped = true;
-                let (code, text) = stop(cause);
-                // The program may have ended its offer; it still can end the goal.
-                let stop = Event::about(FipaEvent::Stop, &handle);
-                let _ = events.send(stop.result(Err(Failure::new(code, text))));
-            }
-        }
-    }
-}
-
-fn stop(cause: Cause) -> (FipaResult, &'static str) {
-    match cause {
-        Cause::DeadlinePassed => (FipaResult::TimedOut, "the time for the goal is over"),
-        Cause::ClientGone => (FipaResult::Gone, "the client of the goal is gone"),
-        Cause::Preempted => (
-            FipaResult::Cancelled,
-            "another goal takes the place of the goal",
-        ),
-        Cause::Withdrawn => (FipaResult::Cancelled, "the action is not offered any more"),
-        _ => (FipaResult::Cancelled, "the goal was cancelled"),
+            Err(failure) => Event::ended(Err(failure)),
+        },
+        Offered::Stop(failure) => Event::about(FipaEvent::Stop, handle).result(Err(failure)),
     }
 }
 
@@ -153,26 +90,7 @@ pub unsafe extern "C" fn fipa_goal_progress(goal: FipaHandle, progress: FipaText
         let goal = table::get::<OpenGoal>(goal)?;
         // SAFETY: The caller promises it.
         let text = unsafe { progress.required("the progress") }?;
-        let read: Map<String, Value> = parsed(text, "the progress")?;
-        let mut progress = Progress::default();
-        for (key, value) in read {
-            progress = match (key.as_str(), value) {
-                ("fraction", Value::Number(part)) => Progress {
-                    fraction: part.as_f64(),
-                    ..progress
-                },
-                ("note", Value::String(note)) => progress.note(note),
-                ("value", value) => progress
-                    .value(&term(value, "the progress")?)
-                    .map_err(|error| Failure::invalid(error.to_string()))?,
-                _ => {
-                    return Err(Failure::invalid(format!(
-                        "the progress has a wrong {key:?}"
-                    )));
-                }
-            };
-        }
-        goal.execution.progress(progress);
+        goal.pursuit.progress(parsed(text, "the progress")?)?;
         Ok(FipaResult::Ok)
     })
 }
@@ -192,15 +110,11 @@ pub unsafe extern "C" fn fipa_goal_end(
         let goal = table::get::<OpenGoal>(goal)?;
         // SAFETY: The caller promises it.
         let text = unsafe { result.read("the result") }?.unwrap_or_default();
-        let result = match is_done {
+        goal.pursuit.end(match is_done {
             0 => Err(text.to_owned()),
-            // An empty sequence is no result.
-            _ if text.is_empty() => Ok(Term::Sequence(Vec::new())),
-            _ => Ok(parsed(text, "the result").and_then(|value| term(value, "the result"))?),
-        };
-        let end = goal.end.lock().take();
-        let over = || Failure::new(FipaResult::Closed, "the goal has ended");
-        end.ok_or_else(over)?.send(result).map_err(|_| over())?;
+            _ if text.is_empty() => Ok(None),
+            _ => Ok(Some(parsed(text, "the result")?)),
+        })?;
         Ok(FipaResult::Ok)
     })
 }
@@ -224,13 +138,13 @@ pub unsafe extern "C" fn fipa_begin_actions(
         // SAFETY: The caller promises it.
         let robot = AgentId::new(unsafe { robot.required("the robot") }?).or_fail()?;
         let agent = own.agent.clone();
-        let events = script(async move |emitter| {
-            let actions = agent.robot(robot).actions().await.or_fail()?;
-            let actions = Text::json(&actions)?;
-            emitter.emit(Event::with(FipaEvent::Result, actions)).await;
-            Ok(())
-        });
-        let began = OperationHandle::of(own.items.follow(tag, events));
+        let listed = async move {
+            match agent.robot(robot).actions().await {
+                Ok(actions) => Event::json(FipaEvent::Result, &actions),
+                Err(error) => Event::ended(Err(Failure::of(error))),
+            }
+        };
+        let began = OperationHandle::of(own.items.begin(tag, listed));
         Ok(table::give(operation, began))
     })
 }
@@ -279,66 +193,18 @@ pub unsafe extern "C" fn fipa_begin_goal(
         }
         let cancel = Arc::new(Notify::new());
         let (agent, cancelling) = (own.agent.clone(), Arc::clone(&cancel));
-        let events = script(async move |emitter| {
-            let robot = agent.robot(robot);
-            let mut running = robot.send(goal).await.or_fail()?;
-            emitter.emit(Event::of(FipaEvent::Accepted)).await;
-            // A goal that has ended already has no progress.
-            let mut updates = running.progress().await.ok();
-            let result = loop {
-                tokio::select! {
-                    biased;
-                    status = async { updates.as_mut()?.next().await.ok().flatten() }, if updates.is_some() => {
-                        match status {
-                            Some(status) => {
-                                let progress = progress(&status)?;
-                                emitter.emit(Event::with(FipaEvent::Progress, progress)).await;
-                            }
-                            None => updates = None,
-                        }
-                    }
-                    result = running.outcome() => break result.or_fail()?,
-                    () = cancelling.notified() => {
-                        running.cancel(CANCEL).await.or_fail()?;
-                    }
-                }
-            };
-            let value = match result {
-                Some(term) => json_of(&term)?,
-                None => Value::Null,
-            };
-            let value = Text::json(&value)?;
-            emitter.emit(Event::with(FipaEvent::Result, value)).await;
-            Ok(())
+        let events = invoke(agent, robot, goal, cancelling).map(|event| match event {
+            Ok(GoalEvent::Accepted) => Event::of(FipaEvent::Accepted),
+            Ok(GoalEvent::Progress(value)) => Event::json(FipaEvent::Progress, &value),
+            Ok(GoalEvent::Result(value)) => Event::json(FipaEvent::Result, &value),
+            Err(failure) => Event::ended(Err(failure)),
         });
         let began = OperationHandle::cancellable(own.items.follow(tag, events), cancel);
         Ok(table::give(operation, began))
     })
 }
 
-fn progress(status: &GoalStatus) -> Result<Text, Failure> {
-    let progress = status.progress.as_ref();
-    let value = progress.and_then(|progress| progress.value.as_ref());
-    let value = value.map(json_of).transpose()?;
-    Text::json(&json!({
-        "state": status.state.as_str(),
-        "fraction": progress.and_then(|progress| progress.fraction),
-        "note": progress.and_then(|progress| progress.note.as_deref()),
-        "value": value,
-    }))
-}
-
 /// Reads JSON of the caller; `what` names it in errors.
 fn parsed<T: DeserializeOwned>(text: &str, what: &str) -> Result<T, Failure> {
     serde_json::from_str(text).map_err(|error| Failure::invalid(format!("{what}: {error}")))
-}
-
-/// Returns the value of the caller in SL.
-fn term(value: Value, what: &str) -> Result<Term<'static>, Failure> {
-    term_from_json(value).map_err(|error| Failure::invalid(format!("{what}: {error}")))
-}
-
-/// Returns a value of another agent in JSON.
-fn json_of(term: &Term<'_>) -> Result<Value, Failure> {
-    term_to_json(term).map_err(|error| Failure::new(FipaResult::Failed, error.to_string()))
 }

@@ -3,21 +3,19 @@
 use std::time::Duration;
 
 use fipa::blocking::Wait;
-use fipa::error::{DeregisterError, SendError};
+use fipa::error::DeregisterError;
 use fipa::{Agent, Deliveries, Incoming, Loan, MessageBuilder, RegisterOptions};
 use futures_util::stream::unfold;
 
 use crate::domain::Membership;
-use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::failure::{FipaResult, call};
 use crate::item::{Event, FipaEvent, Items, OperationHandle, Text};
 use crate::letter::{FipaMessage, Letter};
 use crate::loaned::Loaned;
 use crate::message::Draft;
 use crate::raw::{Extensible, FipaText, Place, Readable, limit, structure};
 use crate::table::{self, FipaHandle, Object};
-
-/// Length of a content in bytes from which it is copied into memory that the receivers read in place.
-const IN_PLACE: usize = 4_096;
+use fipa_bindings::{Failure, FailureKind, OrFail, Sending, send_loan};
 
 /// The description of an agent in the directory. A field that is zero is not set.
 #[repr(C)]
@@ -90,36 +88,20 @@ pub unsafe extern "C" fn fipa_register(
     })
 }
 
-type Sending = Box<dyn Future<Output = Result<Deliveries, SendError>> + Send + Unpin>;
-
-/// Sends a message; the letters leave in the order of the calls. The deadline of the configuration applies if
-/// `within` is `None`.
+/// Sends the message of the caller.
 fn send(
     agent: &Agent,
     draft: &Draft<'_>,
     builder: MessageBuilder,
     within: Option<Duration>,
 ) -> Result<Sending, Failure> {
-    let content = draft.content().filter(|content| content.len() >= IN_PLACE);
-    let Some(content) = content else {
-        let message = draft.with_content(builder)?;
-        return Ok(match within {
-            Some(within) => Box::new(Box::pin(agent.send_within(message, within))),
-            None => Box::new(Box::pin(agent.send(message))),
-        });
+    let copy = |content: &[u8], to: &mut [u8]| {
+        to.copy_from_slice(content);
+        Ok(())
     };
-    let mut loan = agent
-        .loan(draft.complete(builder)?, content.len())
-        .or_fail()?;
-    loan.content_mut().copy_from_slice(content);
-    Ok(send_loan(agent, loan, within))
-}
-
-fn send_loan(agent: &Agent, loan: Loan, within: Option<Duration>) -> Sending {
-    match within {
-        Some(within) => Box::new(Box::pin(agent.send_loan_within(loan, within))),
-        None => Box::new(Box::pin(agent.send_loan(loan))),
-    }
+    let content = draft.content();
+    let content = content.map(|from| (from.len(), move |to: &mut [u8]| copy(from, to)));
+    fipa_bindings::send(agent, draft.complete(builder)?, content, within)
 }
 
 /// Waits for the outcomes, and writes them for the caller.
@@ -135,7 +117,10 @@ fn settle(sending: Sending, outcomes: Option<Place<FipaHandle>>) -> Result<FipaR
 fn all_delivered(outcomes: &Deliveries) -> Result<(), Failure> {
     match outcomes.all_succeeded() {
         true => Ok(()),
-        false => Err(Failure::new(FipaResult::NotDelivered, outcomes.to_string())),
+        false => Err(Failure::new(
+            FailureKind::NotDelivered,
+            outcomes.to_string(),
+        )),
     }
 }
 

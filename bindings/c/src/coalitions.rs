@@ -1,14 +1,14 @@
 //! Coalitions with a leader: the founder and the members.
 
 use fipa::blocking::Wait;
-use fipa::coalitions::{CoalitionOptions, CoalitionState, LedCoalition, Membership};
+use fipa::coalitions::{CoalitionOptions, LedCoalition, Membership};
 use fipa::{Message, MessageBuilder};
+use fipa_bindings::{Failure, FailureKind, OrFail, coalition};
 use futures_util::stream::unfold;
-use serde_json::json;
 
 use crate::agent::OwnAgent;
-use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, FipaEvent, OperationHandle, Text};
+use crate::failure::{FipaResult, call};
+use crate::item::{Event, FipaEvent, OperationHandle};
 use crate::locks::{FipaOwnOptions, own_options};
 use crate::raw::{FipaText, Place, texts};
 use crate::table::{self, FipaHandle, Object};
@@ -31,7 +31,7 @@ impl Object for CoalitionMember {
 
     fn guard(&self, message: MessageBuilder) -> Option<Result<MessageBuilder, Failure>> {
         let guarded = self.membership.guard(message);
-        Some(guarded.map_err(|error| Failure::new(FipaResult::Lost, error.to_string())))
+        Some(guarded.map_err(|error| Failure::new(FailureKind::Lost, error.to_string())))
     }
 
     fn check(&self, message: &Message) -> Option<Result<(), Failure>> {
@@ -68,7 +68,7 @@ pub unsafe extern "C" fn fipa_found_coalition(
         };
         let founded = own.agent.found_coalition(name, members, options).wait();
         let founded =
-            founded.map_err(|error| Failure::new(FipaResult::Failed, error.to_string()))?;
+            founded.map_err(|error| Failure::new(FailureKind::Failed, error.to_string()))?;
         Ok(table::give(coalition, FoundedCoalition(founded)))
     })
 }
@@ -88,7 +88,7 @@ pub unsafe extern "C" fn fipa_change_coalition(
         // SAFETY: The caller promises it.
         let members = unsafe { texts(members, member_count, "a member") }?;
         let changed = founded.0.change(members).wait();
-        changed.map_err(|error| Failure::new(FipaResult::Failed, error.to_string()))?;
+        changed.map_err(|error| Failure::new(FailureKind::Failed, error.to_string()))?;
         Ok(FipaResult::Ok)
     })
 }
@@ -115,10 +115,8 @@ pub unsafe extern "C" fn fipa_join_coalition(
         let name = unsafe { name.required("the name") }?;
         let membership = own.agent.join_coalition(name).or_fail()?;
         let changes = unfold(membership.changes(), |mut changes| async {
-            let event = match shown(&changes.next().await?) {
-                Ok(text) => Event::with(FipaEvent::Change, text),
-                Err(failure) => Event::ended(Err(failure)),
-            };
+            let state = coalition(&changes.next().await?);
+            let event = Event::json(FipaEvent::Change, &state);
             Some((event, changes))
         });
         let joined = CoalitionMember {
@@ -127,15 +125,6 @@ pub unsafe extern "C" fn fipa_join_coalition(
         };
         Ok(table::give(member, joined))
     })
-}
-
-fn shown(state: &CoalitionState) -> Result<Text, Failure> {
-    let members = state.members.as_ref();
-    Text::json(&json!({
-        "members": members.map(|members| members.names()),
-        "leader": members.and_then(|members| members.leader()),
-        "leads": state.leads,
-    }))
 }
 
 /// Gives up the lead of a coalition, if the agent leads. The other members are asked first to lead again.

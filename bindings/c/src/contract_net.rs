@@ -5,16 +5,16 @@ use std::time::Duration;
 
 use fipa::protocol::ContractNet;
 use fipa::{Message, Performative};
-use serde_json::json;
 use tokio::sync::Mutex;
 
 use crate::agent::OwnAgent;
-use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::failure::{FipaResult, call};
 use crate::item::{Event, FipaEvent, Items, OperationHandle, Text, script};
 use crate::letter::{FipaMessage, Letter};
 use crate::message::Draft;
 use crate::raw::{FipaBytes, LONG, Place, elements, limit};
 use crate::table::{self, FipaHandle, Object};
+use fipa_bindings::{Failure, FailureKind, OrFail};
 
 /// Time for the proposals if the caller sets none.
 const TIMEOUT: Duration = Duration::from_secs(10);
@@ -31,16 +31,7 @@ pub(crate) struct OpenCall {
 impl OpenCall {
     fn new(net: ContractNet, items: Items) -> Result<Self, Failure> {
         let bids = net.bids();
-        let refusals: Vec<String> = bids.refusals.iter().map(ToString::to_string).collect();
-        let violations: Vec<String> = bids.violations.iter().map(ToString::to_string).collect();
-        let answers = json!({
-            "proposals": bids.proposals.len(),
-            "refusals": refusals,
-            "silent": bids.silent,
-            "unreached": bids.unreached,
-            "gone": bids.gone,
-            "violations": violations,
-        });
+        let answers = fipa_bindings::bids(bids);
         Ok(Self {
             proposals: bids.proposals.clone(),
             answers: Text::json(&answers)?,
@@ -151,7 +142,7 @@ pub unsafe extern "C" fn fipa_award(
         }
         let taken = open.net.try_lock().ok().and_then(|mut net| net.take());
         let mut net =
-            taken.ok_or_else(|| Failure::new(FipaResult::Closed, "the call was awarded"))?;
+            taken.ok_or_else(|| Failure::new(FailureKind::Closed, "the call was awarded"))?;
         let timeout = limit(timeout_ms).unwrap_or(LONG);
         let calls = Arc::clone(&open);
         open.items.follow(

@@ -1,37 +1,25 @@
 //! Conversations: requests, and serving them.
 
+use std::pin::pin;
 use std::sync::Arc;
-use std::time::Duration;
 
 use bytes::Bytes;
 use fipa::blocking::Wait;
-use fipa::protocol::{DialogueError, Reply, Request, Task};
-use fipa::{Agent, MessageBuilder, Performative};
-use tokio::sync::{Notify, mpsc, oneshot};
+use fipa::protocol::Reply;
+use fipa::{MessageBuilder, Performative};
+use fipa_bindings::{
+    Command, Conversation, Failure, FailureKind, OrFail, RequestEvent, TaskEvent, lead, request,
+};
+use futures_util::StreamExt as _;
+use tokio::sync::{Notify, mpsc};
 
 use crate::agent::OwnAgent;
-use crate::failure::{Failure, FipaResult, OrFail, call};
-use crate::item::{Event, FipaEvent, Following, GivenHandle, Items, OperationHandle, script};
+use crate::failure::{FipaResult, call};
+use crate::item::{Event, FipaEvent, Following, GivenHandle, Items, OperationHandle};
 use crate::letter::{FipaMessage, Letter};
 use crate::message::Draft;
 use crate::raw::{FipaBytes, FipaText, LONG, Place, limit};
 use crate::table::{self, FipaHandle, Object};
-
-/// Time for the answer to a cancel.
-const CANCEL: Duration = Duration::from_secs(10);
-
-/// Begins a request (`fipa-request`) or, if the act is `query-ref` or `query-if`, a query.
-async fn begin(
-    agent: &Agent,
-    message: MessageBuilder,
-    is_query: bool,
-    timeout: Duration,
-) -> Result<Request, DialogueError> {
-    match is_query {
-        true => agent.query(message, timeout).await,
-        false => agent.request(message, timeout).await,
-    }
-}
 
 /// Reads the message of a request.
 ///
@@ -40,12 +28,12 @@ async fn begin(
 unsafe fn opening(
     own: &OwnAgent,
     message: *const FipaMessage,
-) -> Result<(MessageBuilder, bool), Failure> {
+) -> Result<(MessageBuilder, Performative), Failure> {
     // SAFETY: The caller promises it.
     let draft = unsafe { Draft::read(message) }?;
     let act = draft.performative(Some(Performative::Request))?;
-    let is_query = matches!(act, Performative::QueryRef | Performative::QueryIf);
-    Ok((draft.with_content(own.agent.message(act))?, is_query))
+    let message = draft.with_content(own.agent.message(act.clone()))?;
+    Ok((message, act))
 }
 
 /// Requests an action from one agent (FIPA00026), or asks it (FIPA00027) if the performative is `query-ref` or
@@ -66,13 +54,17 @@ pub unsafe extern "C" fn fipa_request(
         let answer = unsafe { Place::of(answer, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
-        let (message, is_query) = unsafe { opening(&own, message) }?;
+        let (message, act) = unsafe { opening(&own, message) }?;
         let timeout = limit(timeout_ms).unwrap_or(LONG);
-        let result = async {
-            let mut request = begin(&own.agent, message, is_query, timeout).await?;
-            request.result().await
+        let events = request(own.agent.clone(), message, &act, timeout, Arc::default());
+        let answer_of = async |event| match event {
+            Ok(RequestEvent::Agreed) => None,
+            Ok(RequestEvent::Answer(answer)) => Some(Ok(answer)),
+            Err(failure) => Some(Err(failure)),
         };
-        let result = Letter::from(result.wait().or_fail()?);
+        let mut answers = pin!(events.filter_map(answer_of));
+        let over = || Failure::new(FailureKind::Closed, "the conversation has ended");
+        let result = Letter::from(answers.next().wait().ok_or_else(over)??);
         Ok(table::give(answer, result))
     })
 }
@@ -96,59 +88,29 @@ pub unsafe extern "C" fn fipa_begin_request(
         let operation = unsafe { Place::of(operation, "the handle") }?;
         let own = table::get::<OwnAgent>(agent)?;
         // SAFETY: The caller promises it.
-        let (message, is_query) = unsafe { opening(&own, message) }?;
+        let (message, act) = unsafe { opening(&own, message) }?;
         let timeout = limit(timeout_ms).unwrap_or(LONG);
         let cancel = Arc::new(Notify::new());
         let (agent, cancelling) = (own.agent.clone(), Arc::clone(&cancel));
-        let events = script(async move |emitter| {
-            let mut request = begin(&agent, message, is_query, timeout).await.or_fail()?;
-            loop {
-                tokio::select! {
-                    agreed = request.agreed() => {
-                        if agreed.or_fail()? {
-                            emitter.emit(Event::of(FipaEvent::Agreed)).await;
-                        }
-                        break;
-                    }
-                    () = cancelling.notified() => cancelled(&mut request).await.or_fail()?,
-                }
+        let events = request(agent, message, &act, timeout, cancelling);
+        let events = events.map(|event| match event {
+            Ok(RequestEvent::Agreed) => Event::of(FipaEvent::Agreed),
+            Ok(RequestEvent::Answer(answer)) => {
+                Event::with(FipaEvent::Answer, Letter::from(answer))
             }
-            let answer = loop {
-                tokio::select! {
-                    answer = request.result() => break answer.or_fail()?,
-                    () = cancelling.notified() => cancelled(&mut request).await.or_fail()?,
-                }
-            };
-            let answer = Letter::from(answer);
-            emitter.emit(Event::with(FipaEvent::Answer, answer)).await;
-            Ok(())
+            Err(failure) => Event::ended(Err(failure)),
         });
         let began = OperationHandle::cancellable(own.items.follow(tag, events), cancel);
         Ok(table::give(operation, began))
     })
 }
 
-/// Cancels a request. It ends with an error, or goes on.
-async fn cancelled(request: &mut Request) -> Result<(), DialogueError> {
-    request.cancel(CANCEL).await.map(drop)
-}
-
 /// A conversation that this agent serves. Its task runs in the background until the last message, or until this
 /// value is dropped.
 struct OpenTask {
     first: Letter,
-    commands: mpsc::Sender<(Command, Done)>,
+    conversation: Conversation,
     items: Items,
-}
-
-type Done = oneshot::Sender<Result<(), Failure>>;
-
-/// A message that the caller sends in a conversation.
-enum Command {
-    Agree(Bytes),
-    Notify(Bytes),
-    Propose(Bytes),
-    Last(Reply),
 }
 
 impl Object for OpenTask {
@@ -181,7 +143,11 @@ pub unsafe extern "C" fn fipa_serve(
         let items = own.items.clone();
         let served = async {
             own.agent.serve(protocol, move |task| {
-                handle(task, events.clone(), items.clone())
+                let (events, items) = (events.clone(), items.clone());
+                let handle = GivenHandle::default();
+                lead(task, move |event| {
+                    events.send(task_event(event, &handle, &items)).is_ok()
+                })
             })
         };
         let served = served.wait().or_fail()?;
@@ -190,63 +156,22 @@ pub unsafe extern "C" fn fipa_serve(
     })
 }
 
-/// Leads a task as the caller commands, and tells the caller if the initiator cancels it or is gone.
-async fn handle(
-    mut task: Task,
-    events: mpsc::UnboundedSender<Event>,
-    items: Items,
-) -> Result<Reply, &'static str> {
-    let (commands, mut commanded) = mpsc::channel::<(Command, Done)>(1);
-    let handle = GivenHandle::default();
-    let open = OpenTask {
-        first: Letter::from(task.message().clone()),
-        commands,
-        items,
-    };
-    if events
-        .send(Event::giving(FipaEvent::Task, open, &handle))
-        .is_err()
-    {
-        return Err("the program has ended its server");
-    }
-    let mut goes_on = true;
-    loop {
-        let command = tokio::select! {
-            command = commanded.recv() => command,
-            cancelled = task.cancelled(), if goes_on => {
-                goes_on = false;
-                let cancelled = cancelled.map_err(Failure::of);
-                // The program may have ended its server; it still can answer.
-                let _ = events.send(Event::about(FipaEvent::Cancel, &handle).result(cancelled));
-                continue;
-            }
-        };
-        let Some((command, done)) = command else {
-            return Err("the program has ended the conversation without a last message");
-        };
-        let result = match command {
-            Command::Agree(content) => task.agree(content).await,
-            Command::Notify(content) => task.inform(content).await,
-            Command::Propose(content) => match task.propose(content, LONG).await {
-                Ok(accepted) => {
-                    let decision = Event::about(FipaEvent::Decision, &handle);
-                    let _ = events.send(decision.number(accepted.into()));
-                    if !accepted {
-                        let _ = done.send(Ok(()));
-                        return Ok(Reply::Nothing);
-                    }
-                    Ok(())
-                }
-                Err(error) => Err(error),
-            },
-            Command::Last(reply) => {
-                let result = task.reply(reply).await;
-                // The caller may no longer wait.
-                let _ = done.send(result.map_err(Failure::of));
-                return Ok(Reply::Nothing);
-            }
-        };
-        let _ = done.send(result.map_err(Failure::of));
+fn task_event(event: TaskEvent, handle: &GivenHandle, items: &Items) -> Event {
+    match event {
+        TaskEvent::Begun(message, conversation) => {
+            let open = OpenTask {
+                first: Letter::from(message),
+                conversation,
+                items: items.clone(),
+            };
+            Event::giving(FipaEvent::Task, open, handle)
+        }
+        TaskEvent::Cancelled(cancelled) => {
+            Event::about(FipaEvent::Cancel, handle).result(cancelled)
+        }
+        TaskEvent::Decided(accepted) => {
+            Event::about(FipaEvent::Decision, handle).number(accepted.into())
+        }
     }
 }
 
@@ -269,48 +194,30 @@ pub enum FipaReply {
     Propose = 5,
 }
 
-impl Command {
-    /// Reads the number of an act. It comes from the caller, and may be any.
-    fn of(act: i32, content: Bytes) -> Result<Self, Failure> {
-        const ACTS: [FipaReply; 6] = [
-            FipaReply::Agree,
-            FipaReply::Inform,
-            FipaReply::Refuse,
-            FipaReply::Failure,
-            FipaReply::Notify,
-            FipaReply::Propose,
-        ];
-        let known = ACTS.into_iter().find(|known| *known as i32 == act);
-        Ok(match known {
-            Some(FipaReply::Agree) => Self::Agree(content),
-            Some(FipaReply::Propose) => Self::Propose(content),
-            Some(FipaReply::Notify) => Self::Notify(content),
-            Some(FipaReply::Inform) => Self::Last(Reply::Inform(content)),
-            Some(FipaReply::Refuse) => Self::Last(Reply::Refuse(content)),
-            Some(FipaReply::Failure) => Self::Last(Reply::Failure(content)),
-            None => {
-                return Err(Failure::invalid(format!(
-                    "there is no act of the number {act}"
-                )));
-            }
-        })
-    }
-}
-
-impl OpenTask {
-    /// Has the background task send a message.
-    fn command(
-        &self,
-        command: Command,
-    ) -> impl Future<Output = Result<(), Failure>> + Send + 'static {
-        let commands = self.commands.clone();
-        async move {
-            let (done, result) = oneshot::channel();
-            let over = || Failure::new(FipaResult::Closed, "the conversation has ended");
-            commands.send((command, done)).await.map_err(|_| over())?;
-            result.await.unwrap_or_else(|_| Err(over()))
+/// Reads the number of an act. It comes from the caller, and may be any.
+fn command(act: i32, content: Bytes) -> Result<Command, Failure> {
+    const ACTS: [FipaReply; 6] = [
+        FipaReply::Agree,
+        FipaReply::Inform,
+        FipaReply::Refuse,
+        FipaReply::Failure,
+        FipaReply::Notify,
+        FipaReply::Propose,
+    ];
+    let known = ACTS.into_iter().find(|known| *known as i32 == act);
+    Ok(match known {
+        Some(FipaReply::Agree) => Command::Agree(content),
+        Some(FipaReply::Propose) => Command::Propose(content),
+        Some(FipaReply::Notify) => Command::Notify(content),
+        Some(FipaReply::Inform) => Command::Last(Reply::Inform(content)),
+        Some(FipaReply::Refuse) => Command::Last(Reply::Refuse(content)),
+        Some(FipaReply::Failure) => Command::Last(Reply::Failure(content)),
+        None => {
+            return Err(Failure::invalid(format!(
+                "there is no act of the number {act}"
+            )));
         }
-    }
+    })
 }
 
 /// Sends a message of a conversation that this agent serves, with one of the acts of `fipa_reply`, and waits until it
@@ -329,7 +236,7 @@ pub unsafe extern "C" fn fipa_task_reply(
         let task = table::get::<OpenTask>(task)?;
         // SAFETY: The caller promises it.
         let content = unsafe { copied(content) }?;
-        task.command(Command::of(act, content)?).wait()?;
+        task.conversation.send(command(act, content)?).wait()?;
         Ok(FipaResult::Ok)
     })
 }
@@ -349,8 +256,9 @@ pub unsafe extern "C" fn fipa_begin_task_reply(
         let task = table::get::<OpenTask>(task)?;
         // SAFETY: The caller promises it.
         let content = unsafe { copied(content) }?;
-        let sent = task.command(Command::of(act, content)?);
-        task.items.begin(tag, async { Event::ended(sent.await) });
+        let sent = task.conversation.send(command(act, content)?);
+        task.items
+            .begin(tag, async { Event::ended(sent.await.map(drop)) });
         Ok(FipaResult::Ok)
     })
 }

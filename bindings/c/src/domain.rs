@@ -2,12 +2,13 @@
 
 use fipa::blocking::{self, Wait};
 use fipa::config::Sources;
-use fipa::{Change, Config, Domain, Matcher, Query};
+use fipa::{Config, Domain, Matcher, Query};
+use fipa_bindings::{Failure, OrFail, flattened};
 use futures_util::StreamExt as _;
-use serde_json::{Value, json};
+use futures_util::stream::iter;
 use std::path::PathBuf;
 
-use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::failure::{FipaResult, call};
 use crate::item::{Event, FipaEvent, Items, OperationHandle, Text};
 use crate::raw::{Extensible, FipaText, Place, Readable, structure, texts};
 use crate::table::{self, FipaHandle, Object};
@@ -171,27 +172,10 @@ pub unsafe extern "C" fn fipa_follow_agents(
         // SAFETY: The caller promises it.
         let operation = unsafe { Place::of(operation, "the handle") }?;
         let membership = table::get::<Membership>(domain)?;
-        let changes = membership.domain.changes().flat_map(|change| {
-            let mut all = Vec::new();
-            flatten(&change, &mut all);
-            let events = all.into_iter().map(|json| match Text::json(&json) {
-                Ok(text) => Event::with(FipaEvent::Change, text),
-                Err(failure) => Event::ended(Err(failure)),
-            });
-            futures_util::stream::iter(events.collect::<Vec<_>>())
-        });
+        let changes = membership.domain.changes();
+        let changes = changes.flat_map(|change| iter(flattened(&change)));
+        let changes = changes.map(|change| Event::json(FipaEvent::Change, &change));
         let began = OperationHandle::of(membership.items.follow(tag, changes));
         Ok(table::give(operation, began))
     })
-}
-
-/// Lists changes that took effect at once one by one.
-fn flatten(change: &Change, all: &mut Vec<Value>) {
-    match change {
-        Change::Joined(entry) => all.push(json!({ "change": "joined", "agent": entry })),
-        Change::Changed { after, .. } => all.push(json!({ "change": "changed", "agent": after })),
-        Change::Left(entry) => all.push(json!({ "change": "left", "agent": entry })),
-        Change::Lagged => all.push(json!({ "change": "lagged" })),
-        Change::Together(changes) => changes.iter().for_each(|change| flatten(change, all)),
-    }
 }

@@ -2,12 +2,9 @@
 
 use std::any::Any;
 use std::cell::RefCell;
-use std::error::Error as _;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use fipa::error::{OpenError, ReceiveError, RegisterError, SendError};
-use fipa::locks::LockError;
-use fipa::protocol::DialogueError;
+use fipa_bindings::{Failure, FailureKind};
 
 use crate::fork;
 
@@ -54,130 +51,32 @@ pub enum FipaResult {
     Panic = -16,
 }
 
-/// A failed call.
-#[derive(Debug)]
-pub(crate) struct Failure {
-    pub(crate) code: FipaResult,
-    pub(crate) text: String,
-}
-
-impl Failure {
-    pub(crate) fn new(code: FipaResult, text: impl Into<String>) -> Self {
-        let text = text.into();
-        Self { code, text }
-    }
-
-    pub(crate) fn invalid(text: impl Into<String>) -> Self {
-        Self::new(FipaResult::Invalid, text)
-    }
-
-    pub(crate) fn of(error: impl Into<fipa::Error>) -> Self {
-        let error = error.into();
-        Self {
-            code: code(&error),
-            // With its causes.
-            text: format!("{error:?}"),
+impl From<FailureKind> for FipaResult {
+    fn from(kind: FailureKind) -> Self {
+        match kind {
+            FailureKind::Invalid => Self::Invalid,
+            FailureKind::BadHandle => Self::BadHandle,
+            FailureKind::Closed => Self::Closed,
+            FailureKind::Forked => Self::Forked,
+            FailureKind::TimedOut => Self::TimedOut,
+            FailureKind::NotDelivered => Self::NotDelivered,
+            FailureKind::Refused => Self::Refused,
+            FailureKind::Gone => Self::Gone,
+            FailureKind::Cancelled => Self::Cancelled,
+            FailureKind::Violation => Self::Violation,
+            FailureKind::Lost => Self::Lost,
+            FailureKind::TooLarge => Self::TooLarge,
+            FailureKind::NameTaken => Self::NameTaken,
+            FailureKind::Stale => Self::Stale,
+            FailureKind::Failed => Self::Failed,
         }
     }
-
-    /// Stores the text as that of the last failure of this thread.
-    pub(crate) fn store(self) -> FipaResult {
-        LAST.replace(self.text);
-        self.code
-    }
 }
 
-/// Turns an error of the library into a failure.
-pub(crate) trait OrFail<T> {
-    fn or_fail(self) -> Result<T, Failure>;
-}
-
-impl<T, E: Into<fipa::Error>> OrFail<T> for Result<T, E> {
-    fn or_fail(self) -> Result<T, Failure> {
-        self.map_err(Failure::of)
-    }
-}
-
-fn code(error: &fipa::Error) -> FipaResult {
-    use fipa::Error;
-    if is_forked(error) {
-        return FipaResult::Forked;
-    }
-    match error {
-        Error::Dialogue(error) => dialogue(error),
-        Error::Send(error) => send(error),
-        Error::Receive(ReceiveError::Closed) => FipaResult::Closed,
-        Error::Lock(error) => lock(error),
-        Error::Admit(_) => FipaResult::Stale,
-        Error::Open(OpenError::Config(_)) => FipaResult::Invalid,
-        Error::Register(RegisterError::AlreadyRegistered { .. }) => FipaResult::NameTaken,
-        Error::Config(_)
-        | Error::Rule(_)
-        | Error::Build(_)
-        | Error::AgentId(_)
-        | Error::Name(_)
-        | Error::Pattern(_)
-        | Error::Performative(_)
-        | Error::Time(_)
-        | Error::Members(_) => FipaResult::Invalid,
-        _ => FipaResult::Failed,
-    }
-}
-
-fn dialogue(error: &DialogueError) -> FipaResult {
-    match error {
-        DialogueError::Refused(_) | DialogueError::Failed(_) | DialogueError::NotUnderstood(_) => {
-            FipaResult::Refused
-        }
-        DialogueError::Cancelled(_) => FipaResult::Cancelled,
-        DialogueError::NotDelivered { .. } | DialogueError::Undelivered(_) => {
-            FipaResult::NotDelivered
-        }
-        DialogueError::TimedOut => FipaResult::TimedOut,
-        DialogueError::Gone { .. } | DialogueError::Unreachable { .. } => FipaResult::Gone,
-        DialogueError::Violation { .. } | DialogueError::WouldViolate(_) => FipaResult::Violation,
-        DialogueError::Build(_) => FipaResult::Invalid,
-        DialogueError::Send(error) => send(error),
-        DialogueError::Receive(_) => FipaResult::Closed,
-        _ => FipaResult::Failed,
-    }
-}
-
-fn send(error: &SendError) -> FipaResult {
-    match error {
-        SendError::NoReceiver | SendError::Build(_) => FipaResult::Invalid,
-        SendError::Violation(_) => FipaResult::Violation,
-        SendError::TooLarge { .. } => FipaResult::TooLarge,
-        SendError::Deregistered => FipaResult::Closed,
-        _ => FipaResult::Failed,
-    }
-}
-
-fn lock(error: &LockError) -> FipaResult {
-    match error {
-        LockError::Name(_) => FipaResult::Invalid,
-        LockError::Unreachable { .. } => FipaResult::Gone,
-        LockError::TimedOut { .. } | LockError::OwnerNotFound { .. } => FipaResult::TimedOut,
-        LockError::Refused { .. } => FipaResult::Refused,
-        LockError::Lost { .. } => FipaResult::Lost,
-        LockError::Closed => FipaResult::Closed,
-        _ => FipaResult::Failed,
-    }
-}
-
-/// Whether the error, or a cause of it, is that this process is a forked child.
-fn is_forked(error: &fipa::Error) -> bool {
-    if matches!(error, fipa::Error::Forked(_)) {
-        return true;
-    }
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        if error.is::<fipa::error::Forked>() {
-            return true;
-        }
-        cause = error.source();
-    }
-    false
+/// Stores the text of a failure as that of the last failure of this thread.
+pub(crate) fn store(failure: Failure) -> FipaResult {
+    LAST.replace(failure.text);
+    failure.kind.into()
 }
 
 thread_local! {
@@ -192,16 +91,18 @@ pub(crate) fn last<T>(read: impl FnOnce(&str) -> T) -> T {
 /// Runs the body of a call: an error becomes its code, and a panic does not reach the caller.
 pub(crate) fn call(body: impl FnOnce() -> Result<FipaResult, Failure>) -> FipaResult {
     if fork::is_child() {
-        return Failure::new(
-            FipaResult::Forked,
+        return store(Failure::new(
+            FailureKind::Forked,
             "this process was forked from one that uses fipa; call exec in the child, or fork before the first call",
-        )
-        .store();
+        ));
     }
     match catch_unwind(AssertUnwindSafe(body)) {
         Ok(Ok(result)) => result,
-        Ok(Err(failure)) => failure.store(),
-        Err(panic) => Failure::new(FipaResult::Panic, panic_text(&*panic)).store(),
+        Ok(Err(failure)) => store(failure),
+        Err(panic) => {
+            LAST.replace(panic_text(&*panic));
+            FipaResult::Panic
+        }
     }
 }
 

@@ -5,9 +5,10 @@ use fipa::blocking::{self, Wait};
 use parking_lot::Mutex;
 
 use crate::domain::{FipaDomainOptions, configured};
-use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::failure::{FipaResult, call};
 use crate::raw::Place;
 use crate::table::{self, FipaHandle, Object};
+use fipa_bindings::{Failure, OrFail};
 
 /// A running gateway, until the caller closes it.
 struct OpenGateway(Mutex<Option<Gateway>>);

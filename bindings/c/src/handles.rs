@@ -3,10 +3,11 @@
 use std::os::fd::AsRawFd as _;
 
 use crate::domain::Membership;
-use crate::failure::{FipaResult, OrFail, call};
+use crate::failure::{FipaResult, call};
 use crate::item::{FipaItem, OperationHandle};
 use crate::raw::{FipaText, Place, fill, fillable, limit};
 use crate::table::{self, FipaHandle};
+use fipa_bindings::OrFail;
 
 /// Takes the next item of a domain; waits for it up to `timeout_ms`, or without a limit if that is negative. Returns
 /// `FIPA_RESULT_EMPTY` if there is none. Several threads may wait; each item goes to one of them.

@@ -2,13 +2,14 @@
 
 use std::sync::{Arc, OnceLock};
 
-use fipa_queue::{Operation, Queue};
+use fipa_bindings::{Emitter, Failure, FailureKind, Operation, Queue};
 use futures_core::Stream;
+use futures_util::StreamExt as _;
 use futures_util::stream::poll_fn;
 use serde::Serialize;
 use tokio::sync::{Notify, mpsc};
 
-use crate::failure::{Failure, FipaResult};
+use crate::failure::{FipaResult, store};
 use crate::raw::Extensible;
 use crate::table::{self, FipaHandle, Object};
 
@@ -130,6 +131,14 @@ impl Event {
         }
     }
 
+    /// An event with a value in JSON.
+    pub(crate) fn json(kind: FipaEvent, value: &impl Serialize) -> Self {
+        match Text::json(value) {
+            Ok(text) => Self::with(kind, text),
+            Err(failure) => Self::ended(Err(failure)),
+        }
+    }
+
     /// An event about an object whose item has come before.
     pub(crate) fn about(kind: FipaEvent, handle: &GivenHandle) -> Self {
         Self {
@@ -171,7 +180,7 @@ impl Event {
             kind: self.kind,
             result: match self.result {
                 Ok(()) => FipaResult::Ok,
-                Err(failure) => failure.store(),
+                Err(failure) => store(failure),
             },
             handle,
             number: self.number,
@@ -185,7 +194,7 @@ pub(crate) struct Text(String);
 impl Text {
     pub(crate) fn json(value: &impl Serialize) -> Result<Self, Failure> {
         let text = serde_json::to_string(value);
-        let text = text.map_err(|error| Failure::new(FipaResult::Failed, error.to_string()));
+        let text = text.map_err(|error| Failure::new(FailureKind::Failed, error.to_string()));
         text.map(Self)
     }
 
@@ -200,39 +209,13 @@ impl Object for Text {
     }
 }
 
-/// Sends the events of an operation. At most two wait, so an operation does not run ahead of its program.
-#[derive(Clone)]
-pub(crate) struct Emitter(mpsc::Sender<Event>);
-
-impl Emitter {
-    pub(crate) async fn emit(&self, event: Event) {
-        // Fails only if the operation was abandoned, which drops this future, too.
-        let _ = self.0.send(event).await;
-    }
-}
-
 /// The events that a function emits. An error is the last one.
-pub(crate) fn script<F>(run: impl FnOnce(Emitter) -> F) -> impl Stream<Item = Event> + Send
+pub(crate) fn script<F>(run: impl FnOnce(Emitter<Event>) -> F) -> impl Stream<Item = Event> + Send
 where
     F: Future<Output = Result<(), Failure>> + Send + 'static,
 {
-    let (sender, mut events) = mpsc::channel(1);
-    let emitter = Emitter(sender);
-    let running = run(emitter.clone());
-    let mut running = Some(Box::pin(async move {
-        if let Err(failure) = running.await {
-            emitter.emit(Event::ended(Err(failure))).await;
-        }
-    }));
-    poll_fn(move |context| {
-        if let Some(script) = &mut running
-            && script.as_mut().poll(context).is_ready()
-        {
-            // Its emitter, too, so that the stream ends after the last event.
-            running = None;
-        }
-        events.poll_recv(context)
-    })
+    let events = fipa_bindings::script(run);
+    events.map(|event| event.unwrap_or_else(|failure| Event::ended(Err(failure))))
 }
 
 /// An operation that was begun.

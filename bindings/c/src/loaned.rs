@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use parking_lot::Mutex;
 
-use crate::failure::{Failure, FipaResult};
 use crate::table::{self, FipaHandle, Object};
+use fipa_bindings::{Failure, FailureKind};
 
 /// A loan of an object, until it is sent.
 pub(crate) struct Loaned<S, L> {
@@ -25,7 +25,8 @@ impl<S: Object, L: Send + 'static> Loaned<S, L> {
     pub(crate) fn take(handle: FipaHandle) -> Result<(Arc<S>, L), Failure> {
         let open = table::get::<Self>(handle)?;
         let taken = open.loan.lock().take();
-        let loan = taken.ok_or_else(|| Failure::new(FipaResult::BadHandle, "the loan was sent"))?;
+        let loan =
+            taken.ok_or_else(|| Failure::new(FailureKind::BadHandle, "the loan was sent"))?;
         drop(table::remove(handle));
         Ok((Arc::clone(&open.source), loan))
     }

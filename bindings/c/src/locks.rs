@@ -8,10 +8,11 @@ use fipa::locks::{Lock, LockError, OwnOptions, Owned};
 use fipa::{Agent, Message, MessageBuilder};
 
 use crate::agent::OwnAgent;
-use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::failure::{FipaResult, call};
 use crate::item::{Event, FipaEvent, OperationHandle, script};
 use crate::raw::{Extensible, FipaText, Place, Readable, fill, limit, structure, texts};
 use crate::table::{self, FipaHandle, Object};
+use fipa_bindings::{Failure, OrFail};
 
 /// A lock that the caller holds.
 pub(crate) struct HeldLock {

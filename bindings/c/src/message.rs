@@ -5,10 +5,11 @@ use std::time::{Duration, UNIX_EPOCH};
 use bytes::Bytes;
 use fipa::{MessageBuilder, Performative, Time};
 
-use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::failure::{FipaResult, call};
 use crate::letter::{FipaLetterInfo, FipaMessage, FipaParameter};
 use crate::raw::{self, FipaBytes, FipaText, Place, elements, fill, texts};
 use crate::table::{self, FipaHandle};
+use fipa_bindings::{Failure, OrFail};
 
 /// The message of a caller, before its sender is known.
 pub(crate) struct Draft<'a> {

@@ -5,7 +5,7 @@ use std::ptr::NonNull;
 use std::time::Duration;
 use std::{ptr, slice};
 
-use crate::failure::Failure;
+use fipa_bindings::Failure;
 
 /// Time limit of a conversation for which the caller sets none: a year.
 pub(crate) const LONG: Duration = Duration::from_secs(365 * 24 * 60 * 60);

@@ -7,9 +7,10 @@ use fipa::{Message, MessageBuilder};
 use parking_lot::RwLock;
 use slotmap::{DefaultKey, Key as _, KeyData, SlotMap};
 
-use crate::failure::{Failure, FipaResult};
+use crate::failure::FipaResult;
 use crate::letter::Letter;
 use crate::raw::Place;
+use fipa_bindings::{Failure, FailureKind};
 
 /// A handle: an index with a generation. Zero is no handle. A handle that was closed is never given out again before
 /// 2^31 others in its place.
@@ -97,7 +98,7 @@ pub(crate) fn remove(handle: FipaHandle) -> Result<Arc<dyn Object>, Failure> {
 /// The error if a handle is not of the kind that a call takes.
 pub(crate) fn other_kind(handle: FipaHandle, expected: &str) -> Failure {
     let text = format!("the handle {handle:#x} is of another kind: expected {expected}");
-    Failure::new(FipaResult::BadHandle, text)
+    Failure::new(FailureKind::BadHandle, text)
 }
 
 /// Returns the key of a handle. Several numbers stand for one key, and only one of them was given out.
@@ -108,5 +109,5 @@ fn key(handle: FipaHandle) -> Option<DefaultKey> {
 
 fn unknown(handle: FipaHandle) -> Failure {
     let text = format!("the handle {handle:#x} was closed, or was never given out");
-    Failure::new(FipaResult::BadHandle, text)
+    Failure::new(FailureKind::BadHandle, text)
 }

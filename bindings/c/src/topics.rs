@@ -9,13 +9,14 @@ use fipa::topics::{Publisher, Topic, TopicLoan};
 
 use crate::agent::OwnAgent;
 use crate::conversation::copied;
-use crate::failure::{Failure, FipaResult, OrFail, call};
+use crate::failure::{FipaResult, call};
 use crate::item::{Event, FipaEvent, OperationHandle, script};
 use crate::letter::{FipaMessage, Letter};
 use crate::loaned::Loaned;
 use crate::message::Draft;
 use crate::raw::{Extensible, FipaBytes, FipaText, Place, Readable, limit, structure};
 use crate::table::{self, FipaHandle, Object};
+use fipa_bindings::{Failure, OrFail};
 
 /// Time for the answer to a subscription, if the caller sets none.
 const TIMEOUT: Duration = Duration::from_secs(30);

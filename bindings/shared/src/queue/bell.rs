@@ -12,7 +12,7 @@ use rustix::io::{read, write};
 
 /// Wakes the thread that waits in the queue, and makes the descriptor readable if the program has asked for it.
 #[derive(Debug)]
-pub(crate) struct Bell {
+pub struct Bell {
     waiting: AtomicWaker,
     descriptor: OnceLock<OwnedFd>,
     /// Whether the descriptor is readable, or will be when it is created.
@@ -20,7 +20,9 @@ pub(crate) struct Bell {
 }
 
 impl Bell {
-    pub(crate) fn new() -> Self {
+    /// Creates a bell without a descriptor.
+    #[must_use]
+    pub fn new() -> Self {
         Self {
             waiting: AtomicWaker::new(),
             descriptor: OnceLock::new(),
@@ -29,12 +31,15 @@ impl Bell {
     }
 
     /// Sets the thread that waits. All other wake-ups reach the descriptor only.
-    pub(crate) fn wait(&self, waker: &Waker) {
+    pub fn wait(&self, waker: &Waker) {
         self.waiting.register(waker);
     }
 
     /// Returns the descriptor. It is readable from the first call on, because items may be ready.
-    pub(crate) fn descriptor(&self) -> io::Result<BorrowedFd<'_>> {
+    ///
+    /// # Errors
+    /// If the process has no descriptor left.
+    pub fn descriptor(&self) -> io::Result<BorrowedFd<'_>> {
         if let Some(descriptor) = self.descriptor.get() {
             return Ok(descriptor.as_fd());
         }
@@ -44,7 +49,7 @@ impl Bell {
 
     /// Makes the descriptor unreadable. Returns false if the program has not asked for it. The caller looks for items
     /// afterwards: a wake-up that happens meanwhile leaves the descriptor as it is.
-    pub(crate) fn quiet(&self) -> bool {
+    pub fn quiet(&self) -> bool {
         let Some(descriptor) = self.descriptor.get() else {
             return false;
         };
@@ -56,13 +61,19 @@ impl Bell {
     }
 
     /// Makes the descriptor readable.
-    pub(crate) fn ring(&self) {
+    pub fn ring(&self) {
         if let Some(descriptor) = self.descriptor.get()
             && !self.rung.swap(true, Ordering::SeqCst)
         {
             // Fails only on an eventfd that is readable already.
             let _ = write(descriptor, &1_u64.to_ne_bytes());
         }
+    }
+}
+
+impl Default for Bell {
+    fn default() -> Self {
+        Self::new()
     }
 }
 

@@ -1,6 +1,10 @@
-#![doc = include_str!("../README.md")]
+//! The queue of a domain handle. A program begins operations with a tag of its own. What it waits for comes out of one
+//! queue, as items with that tag, and a descriptor is readable while the queue may have an item.
+//!
+//! The queue has no thread and stores no item: the thread that asks for the next item polls the operations. So no foreign
+//! code runs on a thread of the library, and letters wait in the queue of their agent until the program takes them.
 
-mod bell;
+pub(crate) mod bell;
 mod slot;
 
 use std::fmt;
@@ -18,8 +22,8 @@ use futures_util::StreamExt as _;
 use futures_util::stream::{SelectAll, once};
 use parking_lot::Mutex;
 
-use crate::bell::Bell;
-use crate::slot::{Abandon, Polled, Slot};
+use crate::queue::bell::Bell;
+use crate::queue::slot::{Abandon, Polled, Slot};
 
 /// A queue of items. A clone is a further handle of the same queue.
 ///

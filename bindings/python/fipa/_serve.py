@@ -1,0 +1,193 @@
+"""Handlers of conversations and goals."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import threading
+import typing
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from fipa._errors import Closed, Error, Refuse
+from fipa._native import Agent, Events, Goal, Task
+
+_log = logging.getLogger("fipa")
+
+_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string", bytes: "bytes", None: "nothing", type(None): "nothing"}
+
+
+class Server:
+    """Calls a handler for each conversation of a protocol, or each goal of an action, until it is closed."""
+
+    def __init__(self, events: Events[Any], handle: Callable[[Any], Any], handler: Callable[..., Any]) -> None:
+        self._events = events
+        self._handle = handle
+        self._running: set[asyncio.Task[None]] = set()
+        self._pool = ThreadPoolExecutor(thread_name_prefix="fipa-handler")
+        #: The handler, so that a decorated function can be called.
+        self.__wrapped__ = handler
+        self.__name__ = getattr(handler, "__name__", "handler")
+        try:
+            loop = asyncio.get_running_loop()
+        except RuntimeError:
+            self._thread: threading.Thread | None = threading.Thread(target=self._follow, name="fipa-server", daemon=True)
+            self._thread.start()
+        else:
+            self._thread = None
+            self._task = loop.create_task(self._follow_in_loop())
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return self.__wrapped__(*arguments, **named)
+
+    def close(self) -> None:
+        """Takes no further conversation or goal. Handlers that run go on."""
+        self._events.close()
+        self._pool.shutdown(wait=False)
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _follow(self) -> None:
+        try:
+            for event in self._events:
+                self._pool.submit(self._run, event)
+        except Closed:
+            pass
+        except RuntimeError:
+            # The pool takes no more work: the server was closed, or the interpreter ends.
+            pass
+
+    def _run(self, event: Any) -> None:
+        asyncio.run(self._guarded(event))
+
+    async def _follow_in_loop(self) -> None:
+        try:
+            async for event in self._events:
+                running = asyncio.get_running_loop().create_task(self._guarded(event))
+                # The loop has only weak references to its tasks.
+                self._running.add(running)
+                running.add_done_callback(self._running.discard)
+        except Closed:
+            pass
+
+    async def _guarded(self, event: Any) -> None:
+        try:
+            await self._handle(event)
+        except Error as error:
+            # The other agent is gone, or has cancelled: a handler cannot change that.
+            _log.info("%s: %s", self.__name__, error)
+
+    async def _call(self, handler: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        """Calls a handler. A plain function runs in the pool, unless this thread is one of it."""
+        if inspect.iscoroutinefunction(handler):
+            return await handler(*arguments, **named)
+        if self._thread is not None:
+            return handler(*arguments, **named)
+        call = lambda: handler(*arguments, **named)  # noqa: E731
+        return await asyncio.get_running_loop().run_in_executor(self._pool, call)
+
+
+async def _until(stopped: Any, work: Any) -> Any:
+    """Does the work, and cancels it when it is to stop."""
+    working = asyncio.ensure_future(work)
+    stopping = asyncio.ensure_future(_awaited(stopped))
+    try:
+        await asyncio.wait({working, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            working.cancel()
+        return await working
+    finally:
+        stopping.cancel()
+        working.cancel()
+
+
+async def _awaited(pending: Any) -> Any:
+    return await pending
+
+
+def serve(agent: Agent, protocol: str, handler: Callable[[Task], Any] | None) -> Any:
+    """Serves a protocol with a handler: see `Agent.serve`."""
+    if handler is None:
+        return lambda handler: serve(agent, protocol, handler)
+
+    async def handle(task: Task) -> None:
+        try:
+            result = await _until(task.cancelled(), server._call(handler, task))
+        except Refuse as refusal:
+            await task.refuse(str(refusal))
+        except asyncio.CancelledError:
+            if not task.is_cancelled:
+                raise
+            if not task.is_over:
+                # Confirms the cancel.
+                await task.inform("")
+        except Exception as error:
+            _log.exception("the handler of %s has failed", protocol)
+            if not task.is_over:
+                await task.fail(f"{type(error).__name__}: {error}")
+        else:
+            if not task.is_over:
+                await task.inform("" if result is None else result)
+
+    server = Server(agent.tasks(protocol), handle, handler)
+    return server
+
+
+def action(agent: Agent, function: Callable[..., Any] | None, name: str | None, policy: Any) -> Any:
+    """Offers a function as an action: see `Agent.action`."""
+    if function is None:
+        return lambda function: action(agent, function, name, policy)
+
+    async def pursue(goal: Goal) -> None:
+        try:
+            result = await _until(goal.stopped(), server._call(function, goal, **goal.arguments))
+        except asyncio.CancelledError:
+            if goal.stop_reason is None:
+                raise
+            goal.fail(goal.stop_reason)
+        except Exception as error:
+            _log.exception("the action %s has failed", server.__name__)
+            goal.fail(f"{type(error).__name__}: {error}")
+        else:
+            goal.succeed(result)
+
+    server = Server(agent.goals(_description(function, name, policy)), pursue, function)
+    return server
+
+
+def _description(function: Callable[..., Any], name: str | None, policy: Any) -> dict[str, Any]:
+    """Describes a function as an action."""
+    hints = typing.get_type_hints(function)
+    parameters = []
+    # The first parameter is the goal.
+    for parameter in list(inspect.signature(function).parameters.values())[1:]:
+        described: dict[str, Any] = {"name": parameter.name, "type": _type(hints.get(parameter.name, Any))}
+        if parameter.default is not parameter.empty:
+            described["optional"] = True
+        parameters.append(described)
+    description = {
+        "name": name or function.__name__,
+        "parameters": parameters,
+        "result": _type(hints.get("return", Any)),
+        "policy": policy,
+    }
+    if function.__doc__:
+        description["description"] = inspect.cleandoc(function.__doc__)
+    return description
+
+
+def _type(hint: Any) -> Any:
+    """Returns the type of a value for the description of an action."""
+    origin = typing.get_origin(hint)
+    if origin is typing.Literal:
+        return {"choice": {"of": [str(word) for word in typing.get_args(hint)]}}
+    if origin in (list, tuple):
+        elements = [element for element in typing.get_args(hint) if element is not ...]
+        return {"list": {"of": _type(elements[0]) if elements else "any"}}
+    return _TYPES.get(hint, "any")

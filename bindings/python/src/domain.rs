@@ -1,0 +1,159 @@
+//! Domains: joining, the directory, and the routes.
+
+use std::path::PathBuf;
+
+use fipa::blocking::{self, Wait as _};
+use fipa::config::Sources;
+use fipa::{Config, Domain as Opened, Matcher, Query, RegisterOptions};
+use fipa_bindings::{Failure, FailureKind, OrFail as _, flattened};
+use futures_util::StreamExt as _;
+use futures_util::stream::iter;
+use pyo3::types::{PyAnyMethods, PyDict, PyDictMethods, PyTuple};
+use pyo3::{Bound, Py, PyAny, PyResult, Python, pyclass, pymethods};
+use serde::Serialize;
+
+use crate::agent::Agent;
+use crate::events::Events;
+use crate::failure::OrRaise as _;
+use crate::kept::{Kept, own_process};
+use crate::pending::{Output, Pending};
+use crate::value::to_python;
+
+/// The membership of this process in a domain.
+///
+/// `Domain()` joins the domain that the environment configures: `$FIPA_CONFIG`, else `./fipa.toml`, else
+/// `~/.config/fipa/fipa.toml`, else `/etc/fipa/fipa.toml`, else the defaults. `config` is another file. `settings`
+/// override it: `Domain(settings={"domain": "test"})`. The end of the interpreter closes it, too.
+#[pyclass(frozen, subclass, weakref, module = "fipa")]
+#[derive(Debug)]
+pub(crate) struct Domain {
+    opened: Kept<Opened>,
+}
+
+#[pymethods]
+impl Domain {
+    #[new]
+    #[pyo3(signature = (config=None, *, settings=None))]
+    fn new(
+        py: Python<'_>,
+        config: Option<PathBuf>,
+        settings: Option<&Bound<'_, PyDict>>,
+    ) -> PyResult<Self> {
+        own_process(py)?;
+        let mut sources = Sources::from_environment();
+        if config.is_some() {
+            sources.file = config;
+        }
+        if let Some(settings) = settings {
+            for (key, value) in settings.iter() {
+                let key: String = key.extract()?;
+                sources.set.push(format!("{key}={}", setting(&value)?));
+            }
+        }
+        let opened = py.detach(|| {
+            let config = Config::load(&sources).or_fail()?;
+            blocking::start().or_fail()?;
+            let opened = Opened::open(&config).wait().or_fail()?;
+            async { opened.follow(sources) }.wait();
+            Ok(opened)
+        });
+        Ok(Self {
+            opened: Kept::new(opened.or_raise(py)?),
+        })
+    }
+
+    /// Registers an agent. `type` is for searches, and `description` for people. Raises `NameTaken` if another agent has
+    /// the name.
+    #[pyo3(signature = (name, *, r#type="", description=""))]
+    fn register(
+        &self,
+        py: Python<'_>,
+        name: String,
+        r#type: &str,
+        description: &str,
+    ) -> PyResult<Pending> {
+        let opened = self.opened.get(py)?.clone();
+        let options = RegisterOptions {
+            agent_type: r#type.to_owned(),
+            description: description.to_owned(),
+            ..RegisterOptions::default()
+        };
+        Ok(Pending::lazy("Domain.register()", async move {
+            let agent = opened.register_with(&name, options).await.or_fail()?;
+            Ok(Box::new(|py: Python<'_>| Ok(Py::new(py, Agent::new(agent))?.into_any())) as Output)
+        }))
+    }
+
+    /// Returns the known agents of this host and of others as dictionaries, with `name`, `type`, `description`, `role`,
+    /// `reach` (`"local"` or `"remote"`), `locations` and others. `pattern` and `type` are names or patterns.
+    #[pyo3(signature = (pattern=None, *, r#type=None))]
+    fn agents(
+        &self,
+        py: Python<'_>,
+        pattern: Option<&str>,
+        r#type: Option<&str>,
+    ) -> PyResult<Py<PyAny>> {
+        let query = Query {
+            name: matcher(py, pattern)?,
+            agent_type: matcher(py, r#type)?,
+            ..Query::all()
+        };
+        let mut found = self.opened.get(py)?.agents();
+        found.retain(|entry| query.matches(entry));
+        listed(py, &found)
+    }
+
+    /// Returns the routes of letters to the agents of a pattern.
+    #[pyo3(signature = (pattern=None))]
+    fn routes(&self, py: Python<'_>, pattern: Option<&str>) -> PyResult<Py<PyAny>> {
+        let query = Query {
+            name: matcher(py, pattern)?,
+            ..Query::all()
+        };
+        listed(py, &self.opened.get(py)?.routes(&query))
+    }
+
+    /// Follows the directory: dictionaries with `change` (`"joined"`, `"changed"` or `"left"`) and `agent`. The change is
+    /// `"lagged"`, without an agent, if the program was too slow and has missed changes.
+    fn changes(&self, py: Python<'_>) -> PyResult<Events> {
+        let changes = self.opened.get(py)?.changes();
+        let changes = changes.flat_map(|change| iter(flattened(&change)));
+        Ok(Events::new(changes.map(|change| {
+            Ok(Box::new(move |py: Python<'_>| to_python(py, &change)) as Output)
+        })))
+    }
+
+    /// Leaves the domain, and deregisters its agents.
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        let opened = self.opened.get(py)?.clone();
+        py.detach(|| opened.close().wait());
+        Ok(())
+    }
+
+    fn __enter__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    #[pyo3(signature = (*_exception))]
+    fn __exit__(&self, py: Python<'_>, _exception: &Bound<'_, PyTuple>) -> PyResult<()> {
+        self.close(py)
+    }
+}
+
+/// Writes a value of the configuration.
+fn setting(value: &Bound<'_, PyAny>) -> PyResult<String> {
+    match value.extract::<bool>() {
+        Ok(value) => Ok(value.to_string()),
+        Err(_) => Ok(value.str()?.to_string()),
+    }
+}
+
+fn matcher(py: Python<'_>, text: Option<&str>) -> PyResult<Option<Matcher>> {
+    text.map(Matcher::parse).transpose().or_fail().or_raise(py)
+}
+
+fn listed(py: Python<'_>, values: &impl Serialize) -> PyResult<Py<PyAny>> {
+    let values = serde_json::to_value(values);
+    let values = values.map_err(|error| Failure::new(FailureKind::Failed, error.to_string()));
+    to_python(py, &values.or_raise(py)?)
+}

@@ -1,0 +1,18 @@
+#![doc = include_str!("../README.md")]
+
+mod actions;
+mod conversation;
+mod failure;
+mod json;
+mod queue;
+mod script;
+mod sending;
+
+pub use crate::actions::{GoalEvent, Offered, Pursuit, action_of, invoke, offered};
+pub use crate::conversation::{Command, Conversation, RequestEvent, TaskEvent, lead, request};
+pub use crate::failure::{Failure, FailureKind, OrFail};
+pub use crate::json::{bids, coalition, flattened};
+pub use crate::queue::bell::Bell;
+pub use crate::queue::{Item, Operation, Queue};
+pub use crate::script::{Emitter, script};
+pub use crate::sending::{Sending, send, send_loan};
