@@ -5,7 +5,7 @@ use fipa::protocol::Notification;
 use fipa::{AgentId, Incoming, Kind, Message};
 use parking_lot::Mutex;
 use pyo3::exceptions::{PyUnicodeDecodeError, PyValueError};
-use pyo3::types::{PyBytes, PyDict, PyDictMethods as _, PyMemoryView, PyTuple};
+use pyo3::types::{PyAnyMethods as _, PyBytes, PyDict, PyDictMethods as _, PyMemoryView, PyTuple};
 use pyo3::{Bound, Py, PyAny, PyResult, Python, pyclass, pymethods};
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -260,6 +260,15 @@ impl Letter {
     #[getter]
     fn age(&self) -> Option<f64> {
         self.notified.as_ref().and_then(|it| it.age)
+    }
+
+    /// Returns the parameters that are set as a dictionary, with the content as a text.
+    fn to_dict(slf: Bound<'_, Self>) -> PyResult<Py<PyAny>> {
+        let to_dict = slf
+            .py()
+            .import("fipa._message")?
+            .getattr("letter_to_dict")?;
+        Ok(to_dict.call1((slf,))?.unbind())
     }
 
     /// Frees the memory of the content. Raises `BufferError` if another object, such as an array of numpy, still reads

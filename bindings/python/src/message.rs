@@ -6,7 +6,8 @@ use fipa::{Agent, MessageBuilder, Performative, Time};
 use fipa_bindings::{Failure, OrFail as _};
 use pyo3::buffer::PyBuffer;
 use pyo3::types::{
-    PyAnyMethods, PyBytes, PyBytesMethods, PyDict, PyDictMethods, PyMemoryView, PyString, PyStringMethods,
+    PyAnyMethods, PyBytes, PyBytesMethods, PyDict, PyDictMethods, PyMemoryView, PyString,
+    PyStringMethods,
 };
 use pyo3::{Bound, Py, PyAny, PyErr, PyResult, Python};
 

@@ -3,6 +3,7 @@
 use std::error::Error as _;
 use std::fmt;
 
+use fipa::actions::ActionError;
 use fipa::error::{OpenError, ReceiveError, RegisterError, SendError};
 use fipa::locks::LockError;
 use fipa::protocol::DialogueError;
@@ -109,7 +110,8 @@ fn kind_of(error: &fipa::Error) -> FailureKind {
         return FailureKind::Forked;
     }
     match error {
-        Error::Dialogue(error) => dialogue(error),
+        Error::Dialogue(error) | Error::Action(ActionError::Dialogue(error)) => dialogue(error),
+        Error::Action(ActionError::Refused(_) | ActionError::Failed(_)) => FailureKind::Refused,
         Error::Send(error) => send(error),
         Error::Receive(ReceiveError::Closed) => FailureKind::Closed,
         Error::Lock(error) => lock(error),

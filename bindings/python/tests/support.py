@@ -1,0 +1,49 @@
+"""What the tests have in common."""
+
+import itertools
+import subprocess
+import sys
+import textwrap
+import unittest
+
+import fipa
+
+_numbers = itertools.count()
+
+
+class Case(unittest.TestCase):
+    """Two agents in a domain."""
+
+    def setUp(self) -> None:
+        self.domain = fipa.Domain()
+        self.addCleanup(self._close)
+        number = f"{type(self).__name__}_{next(_numbers)}"
+        self.rover = self.domain.register(f"rover_{number}").wait()
+        self.arm = self.domain.register(f"arm_{number}", type="arm").wait()
+
+    def _close(self) -> None:
+        try:
+            self.domain.close()
+        except fipa.Closed:
+            pass
+
+    def inform(self, content: object) -> fipa.Message:
+        return fipa.Message("inform", self.arm.name, content)
+
+
+class Loops(Case, unittest.IsolatedAsyncioTestCase):
+    """Two agents in a domain, and an event loop."""
+
+
+def program(source: str) -> subprocess.Popen:
+    """Starts a program of its own in the same domain."""
+    source = "import sys, time, asyncio, threading, os, fipa\n" + textwrap.dedent(source)
+    pipe = subprocess.PIPE
+    return subprocess.Popen([sys.executable, "-c", source], stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+
+
+def finished(test: unittest.TestCase, process: subprocess.Popen, expected: int = 0) -> str:
+    """Waits for the end of a program, and returns its output."""
+    out, errors = process.communicate(timeout=300)
+    test.assertEqual(process.returncode, expected, errors)
+    return out
