@@ -62,10 +62,21 @@ struct Conversation {
     queue: SetAside,
 }
 
+/// The order in which servers are asked for a message, independent of the order in which the application has started
+/// them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Precedence {
+    /// A part of the conversations of a protocol, such as those about actions or a topic.
+    Part,
+    /// All conversations of a protocol.
+    Protocol,
+    /// What no other server handles.
+    Rest,
+}
+
 struct Served {
     number: u64,
-    /// Whether all other servers precede it.
-    is_last: bool,
+    precedence: Precedence,
     opens: Opens,
     queue: SetAside,
 }
@@ -255,31 +266,24 @@ impl Demultiplexer {
         });
     }
 
-    /// Starts a queue for the messages that a server handles: those for which `opens` returns true and
-    /// that belong to no led conversation.
-    pub(crate) fn serve(&self, opens: Opens) -> ReaderKey {
-        self.serve_as(opens, false)
-    }
-
-    /// Starts a queue like [`serve`](Self::serve), for messages that no other server handles.
-    pub(crate) fn serve_last(&self, opens: Opens) -> ReaderKey {
-        self.serve_as(opens, true)
-    }
-
-    fn serve_as(&self, opens: Opens, is_last: bool) -> ReaderKey {
+    /// Starts a queue for the messages that a server handles: those for which `opens` returns true and that belong to no
+    /// led conversation.
+    pub(crate) fn serve(&self, opens: Opens, precedence: Precedence) -> ReaderKey {
         let mut state = self.state.lock();
         let key = state.key("");
         let served = Served {
             number: key.number,
-            is_last,
+            precedence,
             opens,
             queue: SetAside::new(&state.full),
         };
-        let before = state.served.iter().position(|other| other.is_last);
-        match before.filter(|_| !is_last) {
-            Some(before) => state.served.insert(before, served),
-            None => state.served.push(served),
-        }
+        let after = |other: &Served| other.precedence > precedence;
+        let at = state
+            .served
+            .iter()
+            .position(after)
+            .unwrap_or(state.served.len());
+        state.served.insert(at, served);
         key
     }
 
@@ -818,7 +822,7 @@ mod tests {
     #[test]
     fn set_aside_messages_are_bounded_in_bytes() {
         let demultiplexer = Demultiplexer::default();
-        let never = demultiplexer.serve(Box::new(|_| false));
+        let never = demultiplexer.serve(Box::new(|_| false), Precedence::Part);
         let mut state = demultiplexer.state.lock();
         let content = bytes::Bytes::from(vec![0; MAX_SET_ASIDE_BYTES / 4]);
         let large = message_with("arm", ARM, Performative::Inform, content);
@@ -890,7 +894,10 @@ mod tests {
     fn an_agent_that_only_serves_does_not_wait_for_a_reader_of_other_messages() {
         let demultiplexer = Demultiplexer::default();
         let query = Performative::QueryIf;
-        let key = demultiplexer.serve(Box::new(move |message| *message.performative() == query));
+        let key = demultiplexer.serve(
+            Box::new(move |message| *message.performative() == query),
+            Precedence::Protocol,
+        );
         let mut state = demultiplexer.state.lock();
         let other = || message("arm", ARM, Performative::Inform);
         for _ in 0..MAX_SET_ASIDE + 10 {

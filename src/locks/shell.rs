@@ -27,7 +27,7 @@ use super::state_file::StateFile;
 use super::{LockError, LockOptions, report};
 use crate::DirectoryView;
 use crate::agent::AgentCore;
-use crate::agent::demultiplexer::ReaderKey;
+use crate::agent::demultiplexer::{Precedence, ReaderKey};
 use crate::agent::incoming::Incoming;
 use crate::agent::lock_slot::{self, RunningLocks, Slot};
 use crate::domain::background;
@@ -113,7 +113,9 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
     meet_neighbors(core, &me, &shared);
     let task = Task {
         // From here on, no message and no change of the directory is missed.
-        messages: core.demultiplexer.serve(Box::new(lock_slot::is_of_locks)),
+        messages: core
+            .demultiplexer
+            .serve(Box::new(lock_slot::is_of_locks), Precedence::Part),
         changes: Some(endpoint.domain.directory().watch()),
         partners: PartnerWatch::new(Arc::clone(core)),
         watched: HashSet::new(),

@@ -10,7 +10,7 @@ use tokio::task::{JoinError, JoinHandle};
 
 use super::dialogue::{DialogueError, opens};
 use super::participant::{Farewell, Home, Reply, Task};
-use crate::agent::demultiplexer::{Opens, ReaderKey};
+use crate::agent::demultiplexer::{Opens, Precedence, ReaderKey};
 use crate::agent::incoming::Incoming;
 use crate::agent::{Agent, AgentCore};
 use crate::protocol::peer_shares::PeerPlaces;
@@ -23,6 +23,8 @@ impl Agent {
     /// Serves a protocol: each message that begins a conversation of it runs the handler, in a task of
     /// its own on the current tokio runtime. The handler returns the last message. An error becomes a
     /// `failure` with the text of the error, or a `not-understood` if the handler has sent nothing.
+    ///
+    /// Conversations about the actions and topics of the agent go to those, and not to the handler.
     ///
     /// The other messages go to [`receive`](Self::receive). If the application never calls `receive`,
     /// the earliest of 1,024 unread messages is dropped, with a warning in the log.
@@ -53,7 +55,8 @@ impl Agent {
         F: Future<Output = Result<Reply, E>> + Send + 'static,
         E: Display + Send + 'static,
     {
-        serve_those(&self.core, protocol, |_| true, handler)
+        let all = Precedence::Protocol;
+        start(&self.core, protocol, |_| true, all, handler)
     }
 }
 
@@ -69,10 +72,25 @@ where
     F: Future<Output = Result<Reply, E>> + Send + 'static,
     E: Display + Send + 'static,
 {
+    start(core, protocol, also, Precedence::Part, handler)
+}
+
+fn start<H, F, E>(
+    core: &Arc<AgentCore>,
+    protocol: &str,
+    also: impl Fn(&Message) -> bool + Send + Sync + 'static,
+    precedence: Precedence,
+    handler: H,
+) -> Result<Server, DialogueError>
+where
+    H: Fn(Task) -> F + Send + Sync + 'static,
+    F: Future<Output = Result<Reply, E>> + Send + 'static,
+    E: Display + Send + 'static,
+{
     let opens = opening(core, protocol, also)?;
     let runtime = &core.endpoint.domain.inner.service.runtime;
     let running = PeerPlaces::new(MAX_HANDLERS);
-    let queue = ServedQueue::new(core, opens);
+    let queue = ServedQueue::new(core, opens, precedence);
     let run = run(queue, handler, running.clone());
     Ok(Server {
         task: runtime.spawn(run),
@@ -116,17 +134,9 @@ pub(crate) struct ServedQueue {
 }
 
 impl ServedQueue {
-    pub(crate) fn new(core: &Arc<AgentCore>, opens: Opens) -> Self {
+    pub(crate) fn new(core: &Arc<AgentCore>, opens: Opens, precedence: Precedence) -> Self {
         Self {
-            key: core.demultiplexer.serve(opens),
-            core: Arc::clone(core),
-        }
-    }
-
-    /// Starts a queue for the messages that no other server handles.
-    pub(crate) fn last(core: &Arc<AgentCore>, opens: Opens) -> Self {
-        Self {
-            key: core.demultiplexer.serve_last(opens),
+            key: core.demultiplexer.serve(opens, precedence),
             core: Arc::clone(core),
         }
     }

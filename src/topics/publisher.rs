@@ -25,6 +25,7 @@ use super::question::answer_questions;
 use super::rate::MeasuredRate;
 use super::topic::Topic;
 use crate::agent::delivery::{Deliveries, deliveries};
+use crate::agent::demultiplexer::Precedence;
 use crate::agent::incoming::Incoming;
 use crate::agent::topics::{SubscriberStatus, TopicSource, TopicStatus};
 use crate::agent::{Agent, AgentCore};
@@ -85,7 +86,7 @@ impl Agent {
             state: Mutex::new(state),
             room: Notify::new(),
         });
-        let queue = ServedQueue::new(&self.core, opens);
+        let queue = ServedQueue::new(&self.core, opens, Precedence::Part);
         let task = runtime.spawn(accept(queue, Arc::clone(&shared)));
         let source: Weak<dyn TopicSource> = Arc::downgrade(&shared) as _;
         if self.core.topics.add(shared.topic.name(), source) {
@@ -553,7 +554,7 @@ fn start(core: &Arc<AgentCore>) -> Result<(), DialogueError> {
     let opens = opening(core, "fipa-subscribe", move |_| {
         agent.upgrade().is_some_and(|core| !core.topics.is_empty())
     })?;
-    let queue = ServedQueue::last(core, opens);
+    let queue = ServedQueue::new(core, opens, Precedence::Rest);
     let runtime = &core.endpoint.domain.inner.service.runtime;
     runtime.spawn(async move {
         while let Some(first) = queue.next().await {

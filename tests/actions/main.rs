@@ -9,6 +9,7 @@ mod process;
 #[path = "../support/mod.rs"]
 mod support;
 
+use std::convert::Infallible;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -18,7 +19,8 @@ use fipa::actions::{
     ParameterDescription, Policy, Progress, Refusal, Term, Type,
 };
 use fipa::blocking::{Wait, on_thread};
-use fipa::protocol::DialogueError;
+use fipa::protocol::{DialogueError, Reply, Task};
+use fipa::topics::Topic;
 use fipa::{AgentId, Domain, FailureReason, Performative};
 use fipa_testbed::until_async;
 use process::{endless, forever};
@@ -163,6 +165,42 @@ async fn actions_are_listed_invoked_with_progress_and_cancelled() {
         assert!(goal.cancel(TIMEOUT).await.unwrap());
         assert_eq!(crex.status().await.unwrap(), []);
     }
+}
+
+/// An agent serves all requests first, and then offers an action and publishes a topic.
+#[tokio::test(flavor = "multi_thread")]
+async fn goals_and_subscriptions_do_not_go_to_the_server_of_their_protocol() {
+    let (here, there) = two(&patient()).await;
+    let robot = here.register("crex").await.unwrap();
+    let answer = |_: Task| async { Ok::<_, Infallible>(Reply::Inform("served".into())) };
+    let _requests = robot.serve("fipa-request", answer).unwrap();
+    let _subscriptions = robot.serve("fipa-subscribe", answer).unwrap();
+    let _offer = robot
+        .offer(Action::new("blink"), |(): (), _: Execution| async {
+            Ok::<_, String>(())
+        })
+        .unwrap();
+    let topic = robot.publisher(Topic::new("pose").latched(1)).unwrap();
+    topic.publish("(0 0)").await;
+
+    let rover = there.register("rover").await.unwrap();
+    rover
+        .robot(crex())
+        .invoke("blink", &())
+        .await
+        .unwrap()
+        .result::<()>()
+        .await
+        .unwrap();
+    let lift = rover.message(Performative::Request).receiver("crex");
+    let mut lift = rover.request(lift.content("lift"), TIMEOUT).await.unwrap();
+    assert_eq!(lift.result().await.unwrap().content().unwrap(), "served");
+    let pose = rover.message(Performative::Subscribe).receiver("crex");
+    let mut pose = rover
+        .subscribe(pose.content("pose"), TIMEOUT)
+        .await
+        .unwrap();
+    assert_eq!(pose.next().await.unwrap().content().unwrap(), "(0 0)");
 }
 
 #[tokio::test(flavor = "multi_thread")]

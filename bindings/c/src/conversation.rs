@@ -64,7 +64,7 @@ pub unsafe extern "C" fn fipa_request(
         };
         let mut answers = pin!(events.filter_map(answer_of));
         let over = || Failure::new(FailureKind::Closed, "the conversation has ended");
-        let result = Letter::from(answers.next().wait().ok_or_else(over)??);
+        let result = Letter::from(*answers.next().wait().ok_or_else(over)??);
         Ok(table::give(answer, result))
     })
 }
@@ -96,7 +96,7 @@ pub unsafe extern "C" fn fipa_begin_request(
         let events = events.map(|event| match event {
             Ok(RequestEvent::Agreed) => Event::of(FipaEvent::Agreed),
             Ok(RequestEvent::Answer(answer)) => {
-                Event::with(FipaEvent::Answer, Letter::from(answer))
+                Event::with(FipaEvent::Answer, Letter::from(*answer))
             }
             Err(failure) => Event::ended(Err(failure)),
         });
@@ -160,7 +160,7 @@ fn task_event(event: TaskEvent, handle: &GivenHandle, items: &Items) -> Event {
     match event {
         TaskEvent::Begun(message, conversation) => {
             let open = OpenTask {
-                first: Letter::from(message),
+                first: Letter::from(*message),
                 conversation,
                 items: items.clone(),
             };

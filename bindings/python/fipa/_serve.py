@@ -16,7 +16,15 @@ from fipa._native import Agent, Events, Goal, Task
 
 _log = logging.getLogger("fipa")
 
-_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string", bytes: "bytes", None: "nothing", type(None): "nothing"}
+_TYPES = {
+    bool: "boolean",
+    int: "integer",
+    float: "number",
+    str: "string",
+    bytes: "bytes",
+    None: "nothing",
+    type(None): "nothing",
+}
 
 
 class Server:
@@ -33,7 +41,8 @@ class Server:
         try:
             loop = asyncio.get_running_loop()
         except RuntimeError:
-            self._thread: threading.Thread | None = threading.Thread(target=self._follow, name="fipa-server", daemon=True)
+            self._thread: threading.Thread | None = threading.Thread(target=self._follow, name="fipa-server")
+            self._thread.daemon = True
             self._thread.start()
         else:
             self._thread = None
@@ -175,7 +184,7 @@ def _description(function: Callable[..., Any], name: str | None, policy: Any) ->
         "name": name or function.__name__,
         "parameters": parameters,
         "result": _type(hints.get("return", Any)),
-        "policy": policy,
+        "policy": policy or "reject",
     }
     if function.__doc__:
         description["description"] = inspect.cleandoc(function.__doc__)

@@ -83,13 +83,14 @@ impl Agent {
     }
 
     /// Offers a function as an action: a decorator. The name is that of the function; its parameters and their types are
-    /// those of the action, and its docstring describes it. The first parameter is the `Goal`.
-    #[pyo3(signature = (function=None, *, name=None, policy="reject"))]
+    /// those of the action, and its docstring describes it. The first parameter is the `Goal`. `policy` is as in `goals`,
+    /// `"reject"` if it is left out.
+    #[pyo3(signature = (function=None, *, name=None, policy=None))]
     fn action(
         slf: Bound<'_, Self>,
         function: Option<Py<PyAny>>,
         name: Option<&str>,
-        policy: &str,
+        policy: Option<Py<PyAny>>,
     ) -> PyResult<Py<PyAny>> {
         let action = slf.py().import("fipa._serve")?.getattr("action")?;
         Ok(action.call1((slf, function, name, policy))?.unbind())

@@ -58,7 +58,7 @@ pub(crate) struct Request {
 struct Led {
     events: BoxStream<'static, Result<RequestEvent, Failure>>,
     /// An answer that came where an agreement was asked for.
-    answer: Option<Message>,
+    answer: Option<Box<Message>>,
 }
 
 #[pymethods]
@@ -84,7 +84,7 @@ impl Request {
     /// Waits for the answer.
     fn result(&self) -> Pending {
         let led = Arc::clone(&self.led);
-        Pending::begun(async move { Ok(letter::output(answered(led).await?)) })
+        Pending::begun(async move { Ok(letter::output(*answered(led).await?)) })
     }
 
     /// Cancels the request. Its `result` then raises `Cancelled`, unless the other agent is done.
@@ -93,7 +93,7 @@ impl Request {
     }
 }
 
-async fn answered(led: Arc<Mutex<Led>>) -> Result<Message, Failure> {
+async fn answered(led: Arc<Mutex<Led>>) -> Result<Box<Message>, Failure> {
     let mut led = led.lock().await;
     if let Some(answer) = led.answer.take() {
         return Ok(answer);
@@ -120,7 +120,7 @@ impl Agent {
     fn request(&self, message: &Bound<'_, PyAny>, timeout: Option<f64>) -> PyResult<Pending> {
         let request = self.begin_request(message, timeout)?;
         Ok(Pending::lazy("Agent.request()", async move {
-            Ok(letter::output(answered(request.led).await?))
+            Ok(letter::output(*answered(request.led).await?))
         }))
     }
 
@@ -181,7 +181,7 @@ impl Agent {
             |(message, conversation, cancelled)| {
                 Ok(Box::new(|py: Python<'_>| {
                     let task = Task {
-                        letter: Py::new(py, Letter::from(message))?,
+                        letter: Py::new(py, Letter::from(*message))?,
                         conversation: Lock::new(Some(conversation)),
                         cancelled,
                     };
@@ -208,7 +208,7 @@ impl Agent {
 }
 
 type Cancelled = watch::Receiver<Option<Result<(), String>>>;
-type Begun = (Message, Conversation, Cancelled);
+type Begun = (Box<Message>, Conversation, Cancelled);
 
 /// A conversation that the program serves, until its last message. One that is dropped before ends with a failure.
 #[pyclass(frozen, module = "fipa")]

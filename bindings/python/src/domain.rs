@@ -8,7 +8,7 @@ use fipa::{Config, Domain as Opened, Matcher, Query, RegisterOptions};
 use fipa_bindings::{Failure, FailureKind, OrFail as _, flattened};
 use futures_util::StreamExt as _;
 use futures_util::stream::iter;
-use pyo3::types::{PyAnyMethods, PyDict, PyDictMethods, PyTuple};
+use pyo3::types::{PyAnyMethods, PyListMethods, PyMapping, PyMappingMethods, PyTuple};
 use pyo3::{Bound, Py, PyAny, PyResult, Python, pyclass, pymethods};
 use serde::Serialize;
 
@@ -37,7 +37,7 @@ impl Domain {
     fn new(
         py: Python<'_>,
         config: Option<PathBuf>,
-        settings: Option<&Bound<'_, PyDict>>,
+        settings: Option<&Bound<'_, PyMapping>>,
     ) -> PyResult<Self> {
         own_process(py)?;
         let mut sources = Sources::from_environment();
@@ -45,8 +45,8 @@ impl Domain {
             sources.file = config;
         }
         if let Some(settings) = settings {
-            for (key, value) in settings.iter() {
-                let key: String = key.extract()?;
+            for entry in settings.items()?.iter() {
+                let (key, value): (String, Bound<'_, PyAny>) = entry.extract()?;
                 sources.set.push(format!("{key}={}", setting(&value)?));
             }
         }
@@ -76,7 +76,6 @@ impl Domain {
         let options = RegisterOptions {
             agent_type: r#type.to_owned(),
             description: description.to_owned(),
-            ..RegisterOptions::default()
         };
         Ok(Pending::lazy("Domain.register()", async move {
             let agent = opened.register_with(&name, options).await.or_fail()?;

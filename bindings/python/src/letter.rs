@@ -271,8 +271,8 @@ impl Letter {
         Ok(to_dict.call1((slf,))?.unbind())
     }
 
-    /// Frees the memory of the content. Raises `BufferError` if another object, such as an array of numpy, still reads
-    /// it. The letter cannot be read afterwards.
+    /// Ends the view of the content; the letter cannot be read afterwards. The memory is free unless another object, such
+    /// as an array of numpy, still reads it.
     fn release(&self, py: Python<'_>) -> PyResult<()> {
         if let Some(content) = &*self.content.lock() {
             content.call_method0(py, "release")?;

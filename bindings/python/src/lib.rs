@@ -14,7 +14,9 @@ mod events;
 mod failure;
 mod kept;
 mod letter;
+mod lock;
 mod locks;
+mod membership;
 mod message;
 mod pending;
 mod topics;
@@ -31,7 +33,7 @@ mod _native {
     #[pymodule_export]
     use crate::agent::{Agent, Deliveries, Loan};
     #[pymodule_export]
-    use crate::coalitions::{Coalition, Membership};
+    use crate::coalitions::Coalition;
     #[pymodule_export]
     use crate::contract_net::Bids;
     #[pymodule_export]
@@ -45,7 +47,11 @@ mod _native {
     #[pymodule_export]
     use crate::letter::Letter;
     #[pymodule_export]
-    use crate::locks::{Lock, Owned};
+    use crate::lock::Lock;
+    #[pymodule_export]
+    use crate::locks::Owned;
+    #[pymodule_export]
+    use crate::membership::Membership;
     #[pymodule_export]
     use crate::pending::Pending;
     #[pymodule_export]

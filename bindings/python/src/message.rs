@@ -6,15 +6,15 @@ use fipa::{Agent, MessageBuilder, Performative, Time};
 use fipa_bindings::{Failure, OrFail as _};
 use pyo3::buffer::PyBuffer;
 use pyo3::types::{
-    PyAnyMethods, PyBytes, PyBytesMethods, PyDict, PyDictMethods, PyMemoryView, PyString,
-    PyStringMethods,
+    PyAnyMethods, PyBytes, PyBytesMethods, PyListMethods, PyMapping, PyMappingMethods,
+    PyMemoryView, PyString, PyStringMethods,
 };
 use pyo3::{Bound, Py, PyAny, PyErr, PyResult, Python};
 
-use crate::coalitions::Membership;
 use crate::failure::OrRaise as _;
 use crate::letter::Letter;
-use crate::locks::Lock;
+use crate::lock::Lock;
+use crate::membership::Membership;
 
 /// A content of the program, which does not change during a call.
 pub(crate) enum Content<'py> {
@@ -164,8 +164,8 @@ impl<'py> Draft<'py> {
             builder = builder.reply_by(Time::from_system_time(by).or_fail().or_raise(py)?);
         }
         let parameters = self.message.getattr("parameters")?;
-        for (name, value) in parameters.cast::<PyDict>()?.iter() {
-            let (name, value): (String, String) = (name.extract()?, value.extract()?);
+        for parameter in parameters.cast::<PyMapping>()?.items()?.iter() {
+            let (name, value): (String, String) = parameter.extract()?;
             builder = builder.user_defined(&name, &value);
         }
         let lock = self.message.getattr("lock")?;

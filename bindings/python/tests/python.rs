@@ -103,6 +103,11 @@ fn run(tests: &str) {
 }
 
 #[test]
+fn examples() {
+    run("test_examples");
+}
+
+#[test]
 fn messages() {
     run("test_messages");
 }

@@ -152,7 +152,7 @@ class Memory(Case):
         with self.assertRaises(TypeError):
             letter.content[0] = 1
 
-    def test_a_letter_whose_content_is_read_elsewhere_is_not_released(self) -> None:
+    def test_the_memory_of_a_content_stays_while_another_object_reads_it(self) -> None:
         self.rover.send(self.inform(b"x" * 10_000)).wait()
         letter = self.arm.receive().wait(timeout=30)
         other = memoryview(letter.content)
@@ -172,10 +172,10 @@ class Memory(Case):
         self.assertEqual(array.sum(), 2.5 * 100_000)
         address = numpy.frombuffer(letter.content, dtype=numpy.uint8).__array_interface__["data"][0]
         self.assertEqual(array.__array_interface__["data"][0], address)
-        with self.assertRaises(BufferError):
-            letter.release()
+        letter.release()
+        self.assertEqual(array.sum(), 2.5 * 100_000)
 
-    def test_a_thousand_views_do_not_stop_the_other_receivers(self) -> None:
+    def test_hundreds_of_views_do_not_stop_the_other_receivers(self) -> None:
         views = []
         for number in range(300):
             self.rover.send(self.inform(number.to_bytes(4, "big") * 2_500)).wait()

@@ -29,7 +29,7 @@ pub enum RequestEvent {
     /// The other agent has agreed.
     Agreed,
     /// The answer, the last event.
-    Answer(Message),
+    Answer(Box<Message>),
 }
 
 /// Requests an action (FIPA00026), or asks (FIPA00027) if the act of the message is `query-ref` or `query-if`.
@@ -66,7 +66,7 @@ pub fn request(
                 () = cancel.notified() => cancelled(&mut request).await.or_fail()?,
             }
         };
-        emitter.emit(RequestEvent::Answer(answer)).await;
+        emitter.emit(RequestEvent::Answer(Box::new(answer))).await;
         Ok(())
     })
 }
@@ -132,7 +132,7 @@ impl fmt::Debug for Conversation {
 )]
 pub enum TaskEvent {
     /// The conversation has begun with this message.
-    Begun(Message, Conversation),
+    Begun(Box<Message>, Conversation),
     /// The initiator cancels the conversation, or is gone.
     Cancelled(Result<(), Failure>),
     /// The initiator has decided on the proposal: whether it has accepted.
@@ -149,7 +149,7 @@ pub async fn lead(
     tell: impl Fn(TaskEvent) -> bool + Send,
 ) -> Result<Reply, &'static str> {
     let (commands, mut commanded) = mpsc::channel::<(Command, Done)>(1);
-    let begun = TaskEvent::Begun(task.message().clone(), Conversation(commands));
+    let begun = TaskEvent::Begun(Box::new(task.message().clone()), Conversation(commands));
     if !tell(begun) {
         return Err("the program has ended its server");
     }
