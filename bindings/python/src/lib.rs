@@ -1,6 +1,6 @@
 //! The Python interface of `fipa`: the module `fipa._native`, on which the package `fipa` is built.
 //!
-//! No thread of the library runs Python. What a program waits for is a [`Pending`](pending::Pending), which its own
+//! No thread of the library runs Python. What a program waits for is a `Pending`, which its own
 //! threads and event loops poll.
 
 mod actions;
