@@ -6,6 +6,7 @@
 //! this host.
 
 mod directory_sync;
+mod early_letters;
 mod exchange;
 mod exchange_queues;
 mod gateway_agent;

@@ -25,6 +25,7 @@ use fipa_sds::{
 use fipa_transport::{Incarnation, Location, Principal, log_limit};
 use tokio::task::{JoinHandle, JoinSet};
 
+use super::early_letters::{Early, EarlyLetters};
 use super::exchange::Exchanging;
 use super::names::other_claim;
 use super::neighbors::Neighbors;
@@ -323,6 +324,8 @@ struct Task {
     remote_due: Option<Instant>,
     /// The revision of the core that was kept last, and when.
     last_stored: Option<(u64, Instant)>,
+    /// The letters whose senders are not in the directory yet.
+    early: EarlyLetters,
 }
 
 impl Task {
@@ -349,6 +352,7 @@ impl Task {
             remote_read: None,
             remote_due: None,
             last_stored: None,
+            early: EarlyLetters::default(),
         };
         task.take_over();
         Some(task)
@@ -422,7 +426,7 @@ impl Task {
             let second = self.second().map(|second| second.incarnation);
             tokio::select! {
                 received = service.mts.receive(self.own.incarnation) => match received {
-                    Some(received) => self.handle(&received, None),
+                    Some(received) => self.handle(received, None),
                     None => return,
                 },
                 received = service.mts.receive(second.unwrap_or_default()), if second.is_some() => {
@@ -430,7 +434,7 @@ impl Task {
                         return;
                     };
                     let asked = self.second().map(|second| second.id.clone());
-                    self.handle(&received, asked);
+                    self.handle(received, asked);
                 }
                 change = local_changes.next() => {
                     if change.is_none() {
@@ -439,6 +443,7 @@ impl Task {
                     // Several pending changes are handled together.
                     while local_changes.try_next().is_some() {}
                     self.handle_departures();
+                    self.handle_early();
                     self.schedule_remote();
                 }
                 change = remote_changes.next() => {
@@ -447,6 +452,7 @@ impl Task {
                     }
                     while remote_changes.try_next().is_some() {}
                     self.check_name();
+                    self.handle_early();
                     self.schedule_remote();
                 }
                 () = exchanged.df_changed(), if is_df => self.schedule_remote(),
@@ -471,30 +477,46 @@ impl Task {
     }
 
     /// Handles a letter to the agent. `asked` is its second name, if the letter came to that.
-    fn handle(&mut self, received: &Received, asked: Option<AgentId>) {
+    fn handle(&mut self, received: Received, asked: Option<AgentId>) {
         let name = asked.as_ref().map_or(self.own.name(), AgentId::name);
         let message = match Message::decode(received.letter.payload()) {
             Ok(message) => message,
             Err(error) => {
                 log_limit::info!(error = %ErrorChain(&error), agent = name, "cannot decode a letter to an agent of the gateway");
                 let mts = &self.means.service.mts;
-                return mts.handle_undecodable(&name.into(), received, &error);
+                return mts.handle_undecodable(&name.into(), &received, &error);
             }
         };
-        let Some(mut asker) = self.means.asker(&message, received) else {
-            log_limit::info!(
-                agent = name,
-                "cannot answer a letter: its sender is not registered"
-            );
+        let now = now();
+        self.answer(now, Early::new(now.at, message, received, asked));
+    }
+
+    /// Handles the letters whose senders may be in the directory now.
+    fn handle_early(&mut self) {
+        let now = now();
+        for letter in self.early.take() {
+            self.answer(now, letter);
+        }
+    }
+
+    /// Answers a letter, or keeps it until its sender is in the directory.
+    fn answer(&mut self, now: PlatformTime, letter: Early) {
+        let Some(mut asker) = self.means.asker(&letter.message, &letter.received) else {
+            if !self.early.keep(now.at, letter) {
+                let agent = self.own.name();
+                log_limit::info!(
+                    agent,
+                    "cannot answer a letter: its sender is not registered"
+                );
+            }
             return;
         };
-        asker.asked = asked;
-        let now = now();
+        asker.asked = letter.asked;
         match &mut self.core {
             Core::Ams(ams) => {
-                ams.handle_message(now, &asker, &message, &self.means.residents());
+                ams.handle_message(now, &asker, &letter.message, &self.means.residents());
             }
-            Core::Df(df) => df.handle_message(now, &asker, &message),
+            Core::Df(df) => df.handle_message(now, &asker, &letter.message),
         }
     }
 
@@ -509,10 +531,12 @@ impl Task {
     }
 
     fn poll_timeout(&self) -> Option<Instant> {
-        match &self.core {
+        let core = match &self.core {
             Core::Ams(ams) => ams.poll_timeout(),
             Core::Df(df) => df.poll_timeout(),
-        }
+        };
+        let early = self.early.poll_timeout();
+        [core, early].into_iter().flatten().min()
     }
 
     fn handle_timeout(&mut self) {
@@ -520,6 +544,9 @@ impl Task {
         match &mut self.core {
             Core::Ams(ams) => ams.handle_timeout(now),
             Core::Df(df) => df.handle_timeout(now),
+        }
+        if self.early.poll_timeout().is_some_and(|due| due <= now) {
+            self.handle_early();
         }
         self.check_name();
         if self.remote_due.is_some_and(|due| due <= now) {

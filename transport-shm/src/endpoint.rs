@@ -31,7 +31,7 @@ use crate::memory::Budget;
 use crate::outbox::Concluded;
 use crate::outbox::{AnswerLook, MemoryLock, Opening, Outbox};
 use crate::peer_segments::PeerSegments;
-use crate::peers::{BacklogLimits, BacklogStep, Dispatched, OpenOutbox, Peer};
+use crate::peers::{BacklogLimits, BacklogStep, Dispatched, OpenOutbox, Peer, gone};
 use crate::pool::Pool;
 use crate::presence::{Doorbell, POLL_GRACE, PeerProcess, Presence, WordLender, wait_for_polls};
 use crate::shared_files::SHM;
@@ -636,6 +636,15 @@ impl Endpoint {
         // The descriptors of a connection become free when its last user has dropped it; the next attempt finds them.
         if opened.as_ref().is_err_and(errors::lacks_descriptors) && give_up_idle(&mut peers) {
             opened = PeerProcess::open(paths, incarnation);
+        }
+        if opened
+            .as_ref()
+            .is_err_and(|e| e.kind() == ErrorKind::BrokenPipe)
+        {
+            drop(peers);
+            // The end of an open connection would have started it.
+            self.start_cleanup();
+            return Err(gone(incarnation));
         }
         let process = opened.map_err(|e| match e.kind() {
             ErrorKind::NotFound => TransportError::new(

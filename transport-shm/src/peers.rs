@@ -19,6 +19,14 @@ use crate::presence::{PeerProcess, SharedFd, StatusPage, has_ended};
 /// A value that the count of polls does not reach.
 const NEVER: u64 = u64::MAX;
 
+/// Returns the error of a letter to a process that has ended.
+pub(crate) fn gone(incarnation: Incarnation) -> TransportError {
+    TransportError::new(
+        TransportErrorKind::Unreachable,
+        format_args!("process {incarnation} has ended"),
+    )
+}
+
 /// Another process.
 ///
 /// Its end is final. [`Peer::end`] first sets `ended`, then stops the outbox from accepting
@@ -104,7 +112,7 @@ impl Peer {
     ) -> Result<Dispatched, TransportError> {
         let mut line = self.line.lock();
         if self.ended.load(Ordering::SeqCst) {
-            return Err(self.gone());
+            return Err(gone(self.incarnation));
         }
         if !line.is_served
             && let Some(outbox) = &line.outbox
@@ -132,7 +140,7 @@ impl Peer {
     pub(crate) fn outbox(&self) -> Result<OpenOutbox, TransportError> {
         let mut line = self.line.lock();
         if self.ended.load(Ordering::SeqCst) {
-            return Err(self.gone());
+            return Err(gone(self.incarnation));
         }
         match &line.outbox {
             Some(outbox) => Ok(OpenOutbox::Open(Arc::clone(outbox))),
@@ -152,7 +160,7 @@ impl Peer {
     pub(crate) fn opened(&self, outbox: Outbox) -> Result<Arc<Outbox>, TransportError> {
         let mut line = self.line.lock();
         if self.ended.load(Ordering::SeqCst) {
-            return Err(self.gone());
+            return Err(gone(self.incarnation));
         }
         Ok(Arc::clone(line.outbox.insert(Arc::new(outbox))))
     }
@@ -217,13 +225,6 @@ impl Peer {
         conclude_unsent(&failed, error, concluded);
     }
 
-    fn gone(&self) -> TransportError {
-        TransportError::new(
-            TransportErrorKind::Unreachable,
-            format_args!("process {} has ended", self.incarnation),
-        )
-    }
-
     /// Marks the process as ended.
     pub(crate) fn end(&self) {
         self.ended.store(true, Ordering::SeqCst);
@@ -248,7 +249,7 @@ impl Peer {
         if ended {
             let unsent = line.backlog.take();
             drop(line);
-            conclude_unsent(&unsent, &self.gone(), concluded);
+            conclude_unsent(&unsent, &gone(self.incarnation), concluded);
         }
         is_over
     }

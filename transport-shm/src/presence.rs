@@ -255,11 +255,12 @@ pub(crate) struct PeerProcess {
 }
 
 impl PeerProcess {
-    /// Opens the files of a process. The error is `NotFound` if the process does not run.
+    /// Opens the files of a process. The error is `NotFound` if there are none, and `BrokenPipe` if the process has
+    /// ended.
     pub(crate) fn open(paths: &ProcessPaths, of: Incarnation) -> io::Result<Self> {
         let live = open_liveness_fifo(&paths.liveness_fifo(of))?;
         if has_ended(&live) {
-            return Err(ErrorKind::NotFound.into());
+            return Err(ErrorKind::BrokenPipe.into());
         }
         let (page, found) = open_owned(
             &paths.status_page(of),

@@ -204,7 +204,6 @@ fn shared_content_of_a_killed_sender_stays_while_it_is_read() {
     let mut sender = Process::start(&domain, "many", own);
     until("letters", || got.arrivals() >= 8);
     sender.kill();
-    until("the detected end", || receiver.counters().peers_gone == 1);
     let dead = sender.incarnation.to_string();
     until("removal", || {
         !domain.files().iter().any(|file| file.contains(&dead))
@@ -217,6 +216,29 @@ fn shared_content_of_a_killed_sender_stays_while_it_is_read() {
     until("the end of the mapping", || {
         let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
         !maps.contains(&format!("{dead}."))
+    });
+    receiver.close();
+    domain.until_removed();
+}
+
+/// The process is found dead when a letter to it is sent; there was no connection to it before.
+#[test]
+fn the_files_of_a_process_that_ended_before_any_connection_are_removed() {
+    let domain = TestDomain::new();
+    let (receiver, _) = domain.listening();
+    let mut stranger = Process::start(&domain, "receive", Incarnation::from_u64(1));
+    let dead = stranger.incarnation;
+    let is_up = |file: &String| file.contains(&dead.to_string()) && file.ends_with(".live");
+    until("files", || domain.files().iter().any(is_up));
+    stranger.kill();
+    let refused = receiver
+        .post(attempt(), &location_of(dead), parcel(Bytes::new()))
+        .unwrap_err();
+    assert_eq!(refused.fault, TransportErrorKind::Unreachable);
+    assert_eq!(receiver.counters().peers_gone, 0);
+    until("removal", || {
+        let files = domain.files();
+        !files.iter().any(|file| file.contains(&dead.to_string()))
     });
     receiver.close();
     domain.until_removed();
@@ -363,10 +385,8 @@ fn content_of_a_killed_sender_stays_readable() {
     let (receiver, got) = domain.listening();
     let own = receiver.location().incarnation();
     let mut sender = Process::start(&domain, "send", own);
-    // More than one batch, so that the receiver has the sender open as a peer.
     until("letters", || got.arrivals() > 64);
     sender.kill();
-    until("the detected end", || receiver.counters().peers_gone == 1);
     let dead = sender.incarnation.to_string();
     until("removal", || {
         !domain.files().iter().any(|file| file.contains(&dead))

@@ -27,13 +27,14 @@ class Domain(_native.Domain):
         _open.add(self)
 
 
-def _close_all() -> None:
+def _end() -> None:
     for domain in list(_open):
         try:
             domain.close()
         except Error:
             # The program has closed it.
             pass
+    _native._ending()
 
 
 def _forked() -> None:
@@ -42,5 +43,5 @@ def _forked() -> None:
 
 
 # No handler runs any more, and no thread waits for the interpreter when it is gone.
-atexit.register(_close_all)
+atexit.register(_end)
 os.register_at_fork(after_in_child=_forked)

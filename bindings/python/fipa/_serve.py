@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import inspect
 import logging
+import queue
 import threading
 import typing
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import Any
 
 from fipa._errors import Closed, Error, Refuse
@@ -27,6 +29,47 @@ _TYPES = {
 }
 
 
+#: Maximum number of plain functions of a server that run at the same time. Others wait.
+_MAX_WORKERS = 32
+
+
+class _Workers:
+    """Threads that call handlers. The end of the interpreter does not wait for them, unlike for those of
+    `concurrent.futures`: a handler may wait for a letter that never comes.
+    """
+
+    def __init__(self) -> None:
+        self._calls: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = queue.SimpleQueue()
+        self._idle = threading.Semaphore(0)
+        self._count = 0
+
+    def submit(self, call: Callable[[], Any]) -> Future[Any]:
+        """Has a thread call a function. One thread calls this method."""
+        result: Future[Any] = Future()
+        self._calls.put((result, call))
+        if not self._idle.acquire(blocking=False) and self._count < _MAX_WORKERS:
+            self._count += 1
+            threading.Thread(target=self._work, name="fipa-handler", daemon=True).start()
+        return result
+
+    def close(self) -> None:
+        """Has the threads end after the calls that were submitted."""
+        self._calls.put(None)
+
+    def _work(self) -> None:
+        while (submitted := self._calls.get()) is not None:
+            result, call = submitted
+            if result.set_running_or_notify_cancel():
+                try:
+                    result.set_result(call())
+                except BaseException as error:
+                    result.set_exception(error)
+            del result, call, submitted
+            self._idle.release()
+        # For the next thread.
+        self._calls.put(None)
+
+
 class Server:
     """Calls a handler for each conversation of a protocol, or each goal of an action, until it is closed."""
 
@@ -34,7 +77,7 @@ class Server:
         self._events = events
         self._handle = handle
         self._running: set[asyncio.Task[None]] = set()
-        self._pool = ThreadPoolExecutor(thread_name_prefix="fipa-handler")
+        self._workers = _Workers()
         #: The handler, so that a decorated function can be called.
         self.__wrapped__ = handler
         self.__name__ = getattr(handler, "__name__", "handler")
@@ -54,7 +97,7 @@ class Server:
     def close(self) -> None:
         """Takes no further conversation or goal. Handlers that run go on."""
         self._events.close()
-        self._pool.shutdown(wait=False)
+        self._workers.close()
 
     def __enter__(self) -> Server:
         return self
@@ -65,11 +108,8 @@ class Server:
     def _follow(self) -> None:
         try:
             for event in self._events:
-                self._pool.submit(self._run, event)
+                self._workers.submit(functools.partial(self._run, event))
         except Closed:
-            pass
-        except RuntimeError:
-            # The pool takes no more work: the server was closed, or the interpreter ends.
             pass
 
     def _run(self, event: Any) -> None:
@@ -91,15 +131,16 @@ class Server:
         except Error as error:
             # The other agent is gone, or has cancelled: a handler cannot change that.
             _log.info("%s: %s", self.__name__, error)
+        except Exception:
+            _log.exception("%s has failed", self.__name__)
 
     async def _call(self, handler: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        """Calls a handler. A plain function runs in the pool, unless this thread is one of it."""
+        """Calls a handler. A plain function runs in a worker, unless this thread is one."""
         if inspect.iscoroutinefunction(handler):
             return await handler(*arguments, **named)
         if self._thread is not None:
             return handler(*arguments, **named)
-        call = lambda: handler(*arguments, **named)  # noqa: E731
-        return await asyncio.get_running_loop().run_in_executor(self._pool, call)
+        return await asyncio.wrap_future(self._workers.submit(functools.partial(handler, *arguments, **named)))
 
 
 async def _until(stopped: Any, work: Any) -> Any:

@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use crate::buffer::{Lent, Writable};
 use crate::failure::{OrRaise as _, raised};
-use crate::kept::Kept;
+use crate::kept::{Kept, away};
 use crate::letter::{self, Letter};
 use crate::message::Draft;
 use crate::pending::{Pending, seconds};
@@ -119,7 +119,7 @@ impl Agent {
     /// Removes the agent from the directory. What it has not received is dropped.
     fn deregister(&self, py: Python<'_>) -> PyResult<()> {
         let agent = self.registered(py)?.clone();
-        match py.detach(|| agent.deregister()) {
+        match away(py, || agent.deregister()) {
             // The domain was closed before, which has deregistered the agent.
             Ok(_) | Err(DeregisterError::Closed | DeregisterError::NotRegistered(_)) => Ok(()),
             Err(error) => Err(Failure::of(error)).or_raise(py),

@@ -15,7 +15,7 @@ use serde::Serialize;
 use crate::agent::Agent;
 use crate::events::Events;
 use crate::failure::OrRaise as _;
-use crate::kept::{Kept, own_process};
+use crate::kept::{Kept, away, own_process};
 use crate::pending::{Output, Pending};
 use crate::value::to_python;
 
@@ -50,7 +50,7 @@ impl Domain {
                 sources.set.push(format!("{key}={}", setting(&value)?));
             }
         }
-        let opened = py.detach(|| {
+        let opened = away(py, || {
             let config = Config::load(&sources).or_fail()?;
             blocking::start().or_fail()?;
             let opened = Opened::open(&config).wait().or_fail()?;
@@ -125,7 +125,7 @@ impl Domain {
     /// Leaves the domain, and deregisters its agents.
     fn close(&self, py: Python<'_>) -> PyResult<()> {
         let opened = self.opened.get(py)?.clone();
-        py.detach(|| opened.close().wait());
+        away(py, || opened.close().wait());
         Ok(())
     }
 

@@ -43,7 +43,7 @@ mod _native {
     #[pymodule_export]
     use crate::events::Events;
     #[pymodule_export]
-    use crate::kept::forked;
+    use crate::kept::{ending, forked};
     #[pymodule_export]
     use crate::letter::Letter;
     #[pymodule_export]

@@ -17,7 +17,7 @@ use pyo3::types::PyAnyMethods;
 use pyo3::{Bound, Py, PyAny, PyErr, PyResult, Python, pyclass, pymethods};
 
 use crate::failure::raised;
-use crate::kept::own_process;
+use crate::kept::{away, is_ending, own_process};
 use crate::wakeups::Wakeups;
 
 /// What a future has: the value for Python, created on the thread of the program.
@@ -120,7 +120,11 @@ impl Pending {
                 return Err(raised(py, Failure::new(FailureKind::TimedOut, text)));
             }
             let slice = left.map_or(SIGNALS, |left| left.min(SIGNALS));
-            let waited = py.detach(|| (&mut future).wait_within(slice));
+            if is_ending() {
+                let text = "the interpreter ends";
+                return Err(raised(py, Failure::new(FailureKind::Closed, text)));
+            }
+            let waited = away(py, || (&mut future).wait_within(slice));
             ready = waited.map_or(Poll::Pending, Poll::Ready);
             py.check_signals()?;
         }

@@ -196,6 +196,10 @@ class Processes(Case):
             "receiving": "threading.Thread(target=lambda: agent.receive().wait(), daemon=True).start()",
             "iterating": "threading.Thread(target=lambda: next(iter(domain.changes())), daemon=True).start()",
             "serving": "agent.serve('fipa-request', lambda task: time.sleep(60))",
+            "handling": "begun = threading.Event(); client = domain.register(f'{agent.name}_client').wait(); "
+            "agent.serve('fipa-request', lambda task: begun.set() or agent.receive().wait()); "
+            "request = client.request(fipa.Message(receivers=agent.name, content='x')); "
+            "threading.Thread(target=request.wait, daemon=True).start(); begun.wait()",
             "loan": "loan = agent.loan(fipa.Message('inform', agent.name), 1_000_000); view = memoryview(loan)",
             "letter": "agent.send(fipa.Message('inform', agent.name, b'x' * 100_000)).wait(); c = agent.receive().wait().content",
             "loop": "loop = asyncio.new_event_loop(); loop.call_later(0.01, loop.stop); "
