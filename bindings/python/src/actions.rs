@@ -11,7 +11,6 @@ use fipa_bindings::{
 use futures_core::stream::BoxStream;
 use futures_util::StreamExt as _;
 use futures_util::stream::poll_fn;
-use pyo3::types::PyAnyMethods as _;
 use pyo3::{Bound, Py, PyAny, PyResult, Python, pyclass, pymethods};
 use serde_json::{Map, Value};
 use tokio::sync::{Mutex, Notify, mpsc, watch};
@@ -20,6 +19,7 @@ use crate::agent::Agent;
 use crate::conversation::nothing;
 use crate::events::Events;
 use crate::failure::OrRaise as _;
+use crate::interpreter::call;
 use crate::message::LockArgument;
 use crate::pending::{Output, Pending, seconds, step};
 use crate::value::{from_python, to_python};
@@ -92,8 +92,9 @@ impl Agent {
         name: Option<&str>,
         policy: Option<Py<PyAny>>,
     ) -> PyResult<Py<PyAny>> {
-        let action = slf.py().import("fipa._serve")?.getattr("action")?;
-        Ok(action.call1((slf, function, name, policy))?.unbind())
+        let py = slf.py();
+        let arguments = (slf, function, name, policy);
+        Ok(call(py, "fipa._serve", "action", arguments)?.unbind())
     }
 
     /// Lists the actions of a robot as dictionaries, as `goals` reads them.

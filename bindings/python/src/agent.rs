@@ -12,7 +12,8 @@ use serde_json::Value;
 
 use crate::buffer::{Lent, Writable};
 use crate::failure::{OrRaise as _, raised};
-use crate::kept::{Kept, away};
+use crate::interpreter::away;
+use crate::kept::Kept;
 use crate::letter::{self, Letter};
 use crate::message::Draft;
 use crate::pending::{Pending, seconds};

@@ -14,7 +14,7 @@ use futures_core::stream::BoxStream;
 use futures_util::StreamExt as _;
 use futures_util::stream::poll_fn;
 use parking_lot::Mutex as Lock;
-use pyo3::types::{PyAnyMethods, PyTuple};
+use pyo3::types::PyTuple;
 use pyo3::{Bound, Py, PyAny, PyResult, Python, pyclass, pymethods};
 use std::time::Duration;
 use tokio::sync::{Mutex, Notify, mpsc, watch};
@@ -22,6 +22,7 @@ use tokio::sync::{Mutex, Notify, mpsc, watch};
 use crate::agent::Agent;
 use crate::events::Events;
 use crate::failure::OrRaise as _;
+use crate::interpreter::call;
 use crate::letter::{self, Letter};
 use crate::message::{Content, Draft};
 use crate::pending::{Output, Pending, seconds};
@@ -202,8 +203,9 @@ impl Agent {
         protocol: &str,
         handler: Option<Py<PyAny>>,
     ) -> PyResult<Py<PyAny>> {
-        let serve = slf.py().import("fipa._serve")?.getattr("serve")?;
-        Ok(serve.call1((slf, protocol, handler))?.unbind())
+        let py = slf.py();
+        let arguments = (slf, protocol, handler);
+        Ok(call(py, "fipa._serve", "serve", arguments)?.unbind())
     }
 }
 

@@ -15,7 +15,8 @@ use serde::Serialize;
 use crate::agent::Agent;
 use crate::events::Events;
 use crate::failure::OrRaise as _;
-use crate::kept::{Kept, away, own_process};
+use crate::interpreter::away;
+use crate::kept::{Kept, own_process};
 use crate::pending::{Output, Pending};
 use crate::value::to_python;
 

@@ -1,8 +1,9 @@
 //! Exceptions: the classes of the module `fipa._errors`.
 
 use fipa_bindings::{Failure, FailureKind};
-use pyo3::types::PyAnyMethods;
 use pyo3::{Py, PyAny, PyErr, PyResult, Python};
+
+use crate::interpreter::call;
 
 /// Returns the exception for a failure.
 pub(crate) fn raised(py: Python<'_>, failure: Failure) -> PyErr {
@@ -30,8 +31,7 @@ pub(crate) fn exception(py: Python<'_>, failure: Failure) -> PyResult<Py<PyAny>>
         FailureKind::Stale => "Stale",
         FailureKind::Failed => "Error",
     };
-    let class = py.import("fipa._errors")?.getattr(class)?;
-    Ok(class.call1((failure.text,))?.unbind())
+    Ok(call(py, "fipa._errors", class, (failure.text,))?.unbind())
 }
 
 /// Turns a failure into an exception.

@@ -1,15 +1,14 @@
-//! Objects of the library, which their process alone uses and drops, and the end of the interpreter.
+//! Objects of the library, which their process alone uses and drops.
 
 use std::fmt;
 use std::ops::Deref;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::thread::sleep;
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use fipa_bindings::{Failure, FailureKind};
 use pyo3::{PyResult, Python, pyfunction};
 
 use crate::failure::raised;
+use crate::interpreter::{away, end_sections};
 
 static IS_CHILD: AtomicBool = AtomicBool::new(false);
 
@@ -18,8 +17,7 @@ static IS_CHILD: AtomicBool = AtomicBool::new(false);
 #[pyo3(name = "_forked")]
 pub(crate) fn forked() {
     IS_CHILD.store(true, Ordering::Relaxed);
-    // The other threads exist in the parent alone.
-    AWAY.store(0, Ordering::SeqCst);
+    end_sections();
 }
 
 /// Refuses a call in a forked child: a lock of the parent may be taken there forever.
@@ -35,42 +33,6 @@ pub(crate) fn own_process(py: Python<'_>) -> PyResult<()> {
             ),
         )),
     }
-}
-
-/// Number of the threads that are without the interpreter's lock in a call of this module.
-static AWAY: AtomicUsize = AtomicUsize::new(0);
-static IS_ENDING: AtomicBool = AtomicBool::new(false);
-
-/// Does something that may wait without the interpreter's lock.
-///
-/// A thread that asks for the lock after the end of the interpreter is ended by CPython, which unwinds the frames of this
-/// module and so aborts the process. For that reason [`ending`] waits for all threads that are here, and no thread gives
-/// up the lock afterwards.
-pub(crate) fn away<T: Send>(py: Python<'_>, work: impl FnOnce() -> T + Send) -> T {
-    AWAY.fetch_add(1, Ordering::SeqCst);
-    let result = match is_ending() {
-        true => work(),
-        false => py.detach(work),
-    };
-    AWAY.fetch_sub(1, Ordering::SeqCst);
-    result
-}
-
-/// Whether the interpreter ends. Waits then end with an error.
-pub(crate) fn is_ending() -> bool {
-    IS_ENDING.load(Ordering::SeqCst)
-}
-
-/// Has all waits of other threads end, and returns when no thread is without the interpreter's lock.
-#[pyfunction]
-#[pyo3(name = "_ending")]
-pub(crate) fn ending(py: Python<'_>) {
-    IS_ENDING.store(true, Ordering::SeqCst);
-    py.detach(|| {
-        while AWAY.load(Ordering::SeqCst) > 0 {
-            sleep(Duration::from_millis(1));
-        }
-    });
 }
 
 /// An object of the library.

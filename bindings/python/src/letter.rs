@@ -5,12 +5,13 @@ use fipa::protocol::Notification;
 use fipa::{AgentId, Incoming, Kind, Message};
 use parking_lot::Mutex;
 use pyo3::exceptions::{PyUnicodeDecodeError, PyValueError};
-use pyo3::types::{PyAnyMethods as _, PyBytes, PyDict, PyDictMethods as _, PyMemoryView, PyTuple};
+use pyo3::types::{PyBytes, PyDict, PyDictMethods as _, PyMemoryView, PyTuple};
 use pyo3::{Bound, Py, PyAny, PyResult, Python, pyclass, pymethods};
 use std::sync::Arc;
 use std::time::SystemTime;
 
 use crate::buffer::view;
+use crate::interpreter::call;
 use crate::pending::Output;
 use crate::value::sl_loads;
 
@@ -264,11 +265,7 @@ impl Letter {
 
     /// Returns the parameters that are set as a dictionary, with the content as a text.
     fn to_dict(slf: Bound<'_, Self>) -> PyResult<Py<PyAny>> {
-        let to_dict = slf
-            .py()
-            .import("fipa._message")?
-            .getattr("letter_to_dict")?;
-        Ok(to_dict.call1((slf,))?.unbind())
+        Ok(call(slf.py(), "fipa._message", "letter_to_dict", (slf,))?.unbind())
     }
 
     /// Ends the view of the content; the letter cannot be read afterwards. The memory is free unless another object, such

@@ -12,6 +12,7 @@ mod conversation;
 mod domain;
 mod events;
 mod failure;
+mod interpreter;
 mod kept;
 mod letter;
 mod lock;
@@ -43,7 +44,9 @@ mod _native {
     #[pymodule_export]
     use crate::events::Events;
     #[pymodule_export]
-    use crate::kept::{ending, forked};
+    use crate::interpreter::ending;
+    #[pymodule_export]
+    use crate::kept::forked;
     #[pymodule_export]
     use crate::letter::Letter;
     #[pymodule_export]

@@ -13,11 +13,11 @@ use parking_lot::Mutex;
 use pyo3::exceptions::{
     PyRuntimeError, PyRuntimeWarning, PyStopAsyncIteration, PyStopIteration, PyValueError,
 };
-use pyo3::types::PyAnyMethods;
 use pyo3::{Bound, Py, PyAny, PyErr, PyResult, Python, pyclass, pymethods};
 
 use crate::failure::raised;
-use crate::kept::{away, is_ending, own_process};
+use crate::interpreter::{call, is_ending, section};
+use crate::kept::own_process;
 use crate::wakeups::Wakeups;
 
 /// What a future has: the value for Python, created on the thread of the program.
@@ -95,6 +95,14 @@ impl Pending {
         py: Python<'_>,
         timeout: Option<Duration>,
     ) -> PyResult<Option<Py<PyAny>>> {
+        section(py, || self.waited_inside(py, timeout))
+    }
+
+    fn waited_inside(
+        &self,
+        py: Python<'_>,
+        timeout: Option<Duration>,
+    ) -> PyResult<Option<Py<PyAny>>> {
         own_process(py)?;
         let state = replace(&mut *self.state.lock(), State::Over);
         let mut future = match state {
@@ -124,7 +132,7 @@ impl Pending {
                 let text = "the interpreter ends";
                 return Err(raised(py, Failure::new(FailureKind::Closed, text)));
             }
-            let waited = away(py, || (&mut future).wait_within(slice));
+            let waited = py.detach(|| (&mut future).wait_within(slice));
             ready = waited.map_or(Poll::Pending, Poll::Ready);
             py.check_signals()?;
         }
@@ -154,8 +162,7 @@ impl Pending {
 
     fn __await__(slf: Bound<'_, Self>) -> PyResult<Py<PyAny>> {
         let py = slf.py();
-        let drive = py.import("fipa._loop")?.getattr("drive")?;
-        Ok(drive.call1((slf,))?.unbind())
+        Ok(call(py, "fipa._loop", "drive", (slf,))?.unbind())
     }
 
     /// Advances on behalf of an event loop. Returns a tuple with the value, or `None` if it is not there yet: the loop
@@ -211,8 +218,7 @@ impl Pending {
 
     fn __aenter__(slf: Bound<'_, Self>) -> PyResult<Py<PyAny>> {
         let py = slf.py();
-        let enter = py.import("fipa._loop")?.getattr("enter")?;
-        Ok(enter.call1((slf,))?.unbind())
+        Ok(call(py, "fipa._loop", "enter", (slf,))?.unbind())
     }
 
     #[pyo3(signature = (*exception))]
@@ -222,11 +228,7 @@ impl Pending {
     ) -> PyResult<Py<PyAny>> {
         let py = slf.py();
         slf.get().__exit__(py, exception)?;
-        Ok(py
-            .import("fipa._loop")?
-            .getattr("nothing")?
-            .call0()?
-            .unbind())
+        Ok(call(py, "fipa._loop", "nothing", ())?.unbind())
     }
 
     /// Sets the value of the block.
@@ -252,7 +254,7 @@ impl Drop for Pending {
                     return;
                 };
                 let category = py.get_type::<PyRuntimeWarning>();
-                if let Err(error) = PyErr::warn(py, &category, text, 1) {
+                if let Err(error) = section(py, || PyErr::warn(py, &category, text, 1)) {
                     // A warning that is an error has no caller in a destructor.
                     error.write_unraisable(py, None);
                 }

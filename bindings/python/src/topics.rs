@@ -10,13 +10,14 @@ use fipa::protocol::Keep;
 use fipa::topics::{Publisher as Opened, Topic, TopicLoan as OpenLoan};
 use fipa_bindings::{Failure, FailureKind, OrFail as _, script};
 use parking_lot::Mutex;
-use pyo3::types::{PyAnyMethods, PyTuple};
+use pyo3::types::PyTuple;
 use pyo3::{Bound, IntoPyObject as _, Py, PyAny, PyResult, Python, ffi, pyclass, pymethods};
 
 use crate::agent::Agent;
 use crate::buffer::{Lent, Writable};
 use crate::events::Events;
 use crate::failure::OrRaise as _;
+use crate::interpreter::call;
 use crate::letter;
 use crate::message::Content;
 use crate::pending::{Output, Pending, seconds};
@@ -96,8 +97,8 @@ impl Agent {
 /// Raises that a subscription is interrupted.
 fn interrupted(failure: Failure) -> Output {
     Box::new(move |py| {
-        let class = py.import("fipa._errors")?.getattr("Interrupted")?;
-        Err(pyo3::PyErr::from_value(class.call1((failure.text,))?))
+        let error = call(py, "fipa._errors", "Interrupted", (failure.text,))?;
+        Err(pyo3::PyErr::from_value(error))
     })
 }
 

@@ -7,21 +7,20 @@ use pyo3::{Bound, Py, PyAny, PyResult, Python, pyfunction};
 use serde_json::Value;
 
 use crate::failure::{OrRaise as _, raised};
+use crate::interpreter::call;
 
 /// Reads a value of Python as the module `json` writes it; `what` names it in errors.
 pub(crate) fn from_python(value: &Bound<'_, PyAny>, what: &str) -> PyResult<Value> {
     let py = value.py();
     let wrong = |text: String| raised(py, Failure::invalid(format!("{what}: {text}")));
-    let json = py.import("json")?;
-    let text = json.call_method1("dumps", (value,));
+    let text = call(py, "json", "dumps", (value,));
     let text: String = text.map_err(|error| wrong(error.to_string()))?.extract()?;
     serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))
 }
 
 /// Returns a value for Python.
 pub(crate) fn to_python(py: Python<'_>, value: &Value) -> PyResult<Py<PyAny>> {
-    let json = py.import("json")?;
-    Ok(json.call_method1("loads", (value.to_string(),))?.unbind())
+    Ok(call(py, "json", "loads", (value.to_string(),))?.unbind())
 }
 
 /// Writes a value as an expression of SL (FIPA00008): what `json` can write, and dictionaries with a key `"sl"`.
