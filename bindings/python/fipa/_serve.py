@@ -205,7 +205,11 @@ def action(agent: Agent, function: Callable[..., Any] | None, name: str | None, 
             _log.exception("the action %s has failed", server.__name__)
             goal.fail(f"{type(error).__name__}: {error}")
         else:
-            goal.succeed(result)
+            if goal.stop_reason is None:
+                goal.succeed(result)
+            else:
+                # A function that looks at `stop_reason` returns early.
+                goal.fail(goal.stop_reason)
 
     server = Server(agent.goals(_description(function, name, policy)), pursue, function)
     return server

@@ -17,6 +17,7 @@ use crate::events::Events;
 use crate::failure::OrRaise as _;
 use crate::interpreter::away;
 use crate::kept::{Kept, own_process};
+use crate::log;
 use crate::pending::{Output, Pending};
 use crate::value::to_python;
 
@@ -41,6 +42,7 @@ impl Domain {
         settings: Option<&Bound<'_, PyMapping>>,
     ) -> PyResult<Self> {
         own_process(py)?;
+        log::collect(py)?;
         let mut sources = Sources::from_environment();
         if config.is_some() {
             sources.file = config;
@@ -127,7 +129,7 @@ impl Domain {
     fn close(&self, py: Python<'_>) -> PyResult<()> {
         let opened = self.opened.get(py)?.clone();
         away(py, || opened.close().wait());
-        Ok(())
+        log::deliver(py)
     }
 
     fn __enter__(slf: Py<Self>) -> Py<Self> {

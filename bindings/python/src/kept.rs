@@ -9,6 +9,7 @@ use pyo3::{PyResult, Python, pyfunction};
 
 use crate::failure::raised;
 use crate::interpreter::{away, end_sections};
+use crate::log;
 
 static IS_CHILD: AtomicBool = AtomicBool::new(false);
 
@@ -46,6 +47,7 @@ impl<T: Send> Kept<T> {
     /// Returns the object for a call.
     pub(crate) fn get(&self, py: Python<'_>) -> PyResult<&T> {
         own_process(py)?;
+        log::deliver(py)?;
         Ok(self)
     }
 }

@@ -15,6 +15,7 @@ mod failure;
 mod interpreter;
 mod kept;
 mod letter;
+mod log;
 mod lock;
 mod locks;
 mod membership;

@@ -18,6 +18,7 @@ use pyo3::{Bound, Py, PyAny, PyErr, PyResult, Python, pyclass, pymethods};
 use crate::failure::raised;
 use crate::interpreter::{call, is_ending, section};
 use crate::kept::own_process;
+use crate::log;
 use crate::wakeups::Wakeups;
 
 /// What a future has: the value for Python, created on the thread of the program.
@@ -134,6 +135,7 @@ impl Pending {
             }
             let waited = py.detach(|| (&mut future).wait_within(slice));
             ready = waited.map_or(Poll::Pending, Poll::Ready);
+            log::deliver(py)?;
             py.check_signals()?;
         }
     }

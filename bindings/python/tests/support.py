@@ -1,6 +1,7 @@
 """What the tests have in common."""
 
 import itertools
+import os
 import subprocess
 import sys
 import textwrap
@@ -9,6 +10,11 @@ import unittest
 import fipa
 
 _numbers = itertools.count()
+
+
+def times(usual: int, long: int) -> int:
+    """Returns the number of repetitions: `long` if `FIPA_LONG_TESTS` is set."""
+    return long if "FIPA_LONG_TESTS" in os.environ else usual
 
 
 class Case(unittest.TestCase):

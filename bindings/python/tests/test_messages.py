@@ -7,7 +7,8 @@ import unittest
 from datetime import datetime, timedelta, timezone
 
 import fipa
-from support import Case, finished, program
+from fipa import _log
+from support import Case, finished, program, times
 
 try:
     import numpy
@@ -195,9 +196,34 @@ class Memory(Case):
 
         exchange(2_000)
         before = pages()
-        exchange(10_000)
+        exchange(times(10_000, 1_000_000))
         # 10,000 letters of 1 KB that stayed would be 2,500 pages.
         self.assertLess(pages() - before, 1_000)
+
+
+class Logging(unittest.TestCase):
+    def test_lines_of_the_library_go_to_logging(self) -> None:
+        with self.assertLogs("fipa", "INFO") as logs:
+            with fipa.Domain() as domain, domain.register("logged").wait():
+                pass
+        joined = [line for line in logs.output if line.startswith("INFO:fipa.domain.change_log:joined name=logged ")]
+        self.assertEqual(len(joined), 1, logs.output)
+
+    def test_the_level_of_the_logger_is_that_of_the_library(self) -> None:
+        with self.assertNoLogs("fipa", "WARNING"):
+            with fipa.Domain() as domain, domain.register("not_logged").wait():
+                pass
+
+    def test_dropped_lines_are_counted(self) -> None:
+        with self.assertLogs("fipa") as logs:
+            _log.emit([(30, "fipa.mts.core", "{is not a format} %s")], 2)
+        self.assertEqual(
+            logs.output,
+            [
+                "WARNING:fipa.mts.core:{is not a format} %s",
+                "WARNING:fipa:2 older lines were dropped: the program made no call for too long",
+            ],
+        )
 
 
 class Crash(Case):

@@ -9,23 +9,23 @@ import time
 import unittest
 
 import fipa
-from support import Case, Loops, finished, program
+from support import Case, Loops, finished, program, times
 
 
 class Cancelling(Loops):
     async def test_a_cancelled_wait_loses_no_letter(self) -> None:
-        count = 10_000
+        letters = times(10_000, 100_000)
         choice = random.Random(7)
 
         async def send() -> None:
-            for first in range(0, count, 50):
+            for first in range(0, letters, 50):
                 numbers = range(first, first + 50)
                 for sent in [self.rover.send(self.inform(number.to_bytes(4, "big"))) for number in numbers]:
                     await sent
 
         sending = asyncio.ensure_future(send())
         received, cancelled = [], 0
-        while len(received) < count:
+        while len(received) < letters:
             try:
                 limit = choice.choice([0, 0, 0.00001, 0.0001, 1])
                 letter = await asyncio.wait_for(self.arm.receive(), limit)
@@ -35,7 +35,7 @@ class Cancelling(Loops):
             else:
                 received.append(int.from_bytes(letter.content, "big"))
         await sending
-        self.assertEqual(received, list(range(count)))
+        self.assertEqual(received, list(range(letters)))
         self.assertGreater(cancelled, 100)
 
     async def test_a_task_that_is_cancelled_after_the_arrival_leaves_the_letter(self) -> None:
@@ -133,8 +133,8 @@ class Threads(Case):
             """
             domain = fipa.Domain()
             agent = domain.register("interrupted").wait()
-            print("ready", flush=True)
             try:
+                print("ready", flush=True)
                 agent.receive().wait()
             except KeyboardInterrupt:
                 print("interrupted")
@@ -210,7 +210,7 @@ class Processes(Case):
         choice = random.Random(5)
         for name, source in moments.items():
             running = []
-            for number in range(3):
+            for number in range(times(3, 120)):
                 running.append(
                     program(
                         f"""
@@ -223,9 +223,14 @@ time.sleep({choice.random() * 0.05})
                         """
                     )
                 )
-            for process in running:
-                with self.subTest(name):
-                    finished(self, process)
+                if len(running) == 3:
+                    self._finish(name, running)
+            self._finish(name, running)
+
+    def _finish(self, name: str, running: list) -> None:
+        while running:
+            with self.subTest(name):
+                finished(self, running.pop())
 
 
 if __name__ == "__main__":
