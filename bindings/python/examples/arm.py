@@ -4,7 +4,7 @@ Run it, and ask it from another terminal:
 
     python3 arm.py
     fipa request arm_1 crate
-    fipa goal arm_1 move x=1.5
+    fipa do arm_1 move x=1.5
     fipa subscribe arm_1 temperature
 """
 
