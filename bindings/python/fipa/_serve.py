@@ -176,7 +176,7 @@ def serve(agent: Agent, protocol: str, handler: Callable[[Task], Any] | None) ->
                 raise
             if not task.is_over:
                 # Confirms the cancel.
-                await task.inform("")
+                await task.inform("cancelled")
         except Exception as error:
             _log.exception("the handler of %s has failed", protocol)
             if not task.is_over:
