@@ -16,6 +16,12 @@ static inline fipa_bytes bytes(const char *text) {
   return (fipa_bytes){(const uint8_t *)text, strlen(text)};
 }
 
+/* Copies a text of the library, which need not end with NUL, to one that does. */
+static inline const char *copy(char *into, size_t size, const uint8_t *data, size_t len) {
+  snprintf(into, size, "%.*s", (int)len, (const char *)data);
+  return into;
+}
+
 /* Ends the program if a call has failed. */
 static inline void must(fipa_result result) {
   if (result != FIPA_RESULT_OK) {

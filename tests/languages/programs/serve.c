@@ -9,7 +9,7 @@ enum { LETTERS = 1, LETTERS_OF_SECOND, REQUESTS, GOALS };
 static fipa_handle domain, agent, second, bay, charge;
 /* The goal that is pursued, and the number to which it counts. */
 static fipa_handle goal;
-static char to[16];
+static char number[16];
 /* The last command with a fence. */
 static fipa_handle command;
 
@@ -66,10 +66,10 @@ static void lock(fipa_handle task, int64_t limit) {
 }
 
 static void handle(fipa_handle task) {
-  char content[32] = "";
+  char content[32];
   fipa_bytes read;
   must(fipa_read_content(task, &read));
-  memcpy(content, read.data, read.len < sizeof content ? read.len : sizeof content - 1);
+  copy(content, sizeof content, read.data, read.len);
   if (strcmp(content, "lift") == 0) {
     reply(task, FIPA_REPLY_AGREE, "");
     reply(task, FIPA_REPLY_INFORM, "lifted");
@@ -79,11 +79,11 @@ static void handle(fipa_handle task) {
     reply(task, FIPA_REPLY_AGREE, "");
     reply(task, FIPA_REPLY_FAILURE, "no motor");
   } else if (strcmp(content, "wait") == 0) {
-    reply(task, FIPA_REPLY_AGREE, "");
-    /* Until the leader cancels. */
+    /* Until the leader cancels, which it may have done before the agreement. */
+    fipa_task_reply(task, FIPA_REPLY_AGREE, bytes(""));
     return;
   } else if (strcmp(content, "go") == 0) {
-    must(fipa_goal_end(goal, 1, text(to)));
+    must(fipa_goal_end(goal, 1, text(number)));
     must(fipa_close(goal));
     reply(task, FIPA_REPLY_INFORM, "");
   } else if (strncmp(content, "publish ", 8) == 0) {
@@ -104,10 +104,11 @@ static void handle(fipa_handle task) {
 }
 
 static void pursue(fipa_handle begun) {
-  fipa_text arguments;
+  char arguments[32];
+  fipa_text json;
   goal = begun;
-  must(fipa_read_text(goal, &arguments));
-  sscanf((const char *)arguments.data, "{\"to\":%15[0-9]}", to);
+  must(fipa_read_text(goal, &json));
+  sscanf(copy(arguments, sizeof arguments, json.data, json.len), "{\"to\":%15[0-9]}", number);
   must(fipa_goal_progress(goal, text("{\"fraction\": 0.5, \"note\": \"half way\"}")));
 }
 

@@ -88,8 +88,8 @@ class server {
       task.agree().value();
       task.fail("no motor").value();
     } else if (content == "wait") {
-      task.agree().value();
-      // Until the leader cancels. The leader does not wait for the one before.
+      // Until the leader cancels, which it may have done before the agreement.
+      (void)task.agree();
       waiting_ = std::move(task);
     } else if (content == "go") {
       goal_.succeed(to_).value();

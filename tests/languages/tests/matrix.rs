@@ -17,7 +17,7 @@ use fipa::{Config, Domain};
 use fipa_testbed::{ChildGuard, can_run};
 
 /// Number of pairs that run at the same time.
-const AT_ONCE: usize = 3;
+const AT_ONCE: usize = 4;
 /// Time in seconds after which a leader that hangs is killed. No run takes a tenth of it.
 const WATCHDOG: &str = "200";
 /// The step at which the server is killed.
@@ -132,7 +132,7 @@ impl PairDomain {
         let name = format!("languages-{}-{number}", std::process::id());
         let runtime = dir.path().join("run");
         let text = format!(
-            "domain = \"{name}\"\nruntime_dir = \"{}\"\n[monitor]\ncheck = \"warn\"\n",
+            "domain = \"{name}\"\nruntime_dir = \"{}\"\n[monitor]\ncheck = \"warn\"\n[mts]\ndeadline = \"2min\"\n",
             runtime.display()
         );
         fs::write(dir.path().join("fipa.toml"), text).expect("the configuration can be written");
