@@ -129,7 +129,7 @@ struct PairDomain {
 impl PairDomain {
     fn new(number: usize) -> Self {
         let dir = tempfile::tempdir().expect("a directory");
-        let name = format!("languages-{}-{number}", std::process::id());
+        let name = format!("languages-{}-{number:02}", std::process::id());
         let runtime = dir.path().join("run");
         let text = format!(
             "domain = \"{name}\"\nruntime_dir = \"{}\"\n[monitor]\ncheck = \"warn\"\n[mts]\ndeadline = \"2min\"\n",
