@@ -125,7 +125,9 @@ impl Subscriber for Collector {
 
 /// Returns the name of the logger for a module: `fipa.mts.core` for `fipa_mts::core`.
 fn logger(target: &str) -> String {
-    let own = target.strip_prefix("fipa_").or(target.strip_prefix("fipa::"));
+    let own = target
+        .strip_prefix("fipa_")
+        .or(target.strip_prefix("fipa::"));
     format!("fipa.{}", own.unwrap_or(target).replace("::", "."))
 }
 
@@ -149,4 +151,3 @@ impl Visit for Text {
         };
     }
 }
-

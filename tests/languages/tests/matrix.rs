@@ -127,9 +127,14 @@ struct PairDomain {
 }
 
 impl PairDomain {
-    fn new(number: usize) -> Self {
-        let dir = tempfile::tempdir().expect("a directory");
-        let name = format!("languages-{}-{number:02}", std::process::id());
+    fn new() -> Self {
+        let dir = tempfile::Builder::new()
+            .prefix("languages-")
+            .tempdir()
+            .expect("a directory");
+        // Its random characters also tell the files in shared memory apart.
+        let name = dir.path().file_name().expect("a name");
+        let name = name.to_string_lossy().into_owned();
         let runtime = dir.path().join("run");
         let text = format!(
             "domain = \"{name}\"\nruntime_dir = \"{}\"\n[monitor]\ncheck = \"warn\"\n[mts]\ndeadline = \"2min\"\n",
@@ -258,7 +263,7 @@ fn each_language_observes_the_same_from_each() {
             }
             let leader = &languages[number / languages.len()];
             let server = &languages[number % languages.len()];
-            let domain = PairDomain::new(number);
+            let domain = PairDomain::new();
             let observed = run(&workshop, &domain, leader, server);
             let pair = format!("{} leads {}", leader.name, server.name);
             assert_eq!(observed, expected, "{pair}");
