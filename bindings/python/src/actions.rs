@@ -21,7 +21,7 @@ use crate::events::Events;
 use crate::failure::OrRaise as _;
 use crate::interpreter::call;
 use crate::message::LockArgument;
-use crate::pending::{Output, Pending, seconds, step};
+use crate::pending::{Output, Pending, begun, seconds, step};
 use crate::value::{from_python, to_python};
 
 /// Reads an object of the program.
@@ -143,7 +143,7 @@ impl Agent {
         let events = invoke(agent, robot, goal, Arc::clone(&cancel));
         Ok(RemoteGoal {
             led: Arc::new(Mutex::new(Led {
-                events: events.boxed(),
+                events: begun(events),
                 result: None,
             })),
             cancel,

@@ -10,6 +10,7 @@ use fipa_bindings::{
     Command, Conversation, Failure, FailureKind, OrFail as _, RequestEvent, TaskEvent, lead,
     request,
 };
+use futures_core::Stream;
 use futures_core::stream::BoxStream;
 use futures_util::StreamExt as _;
 use futures_util::stream::poll_fn;
@@ -25,7 +26,7 @@ use crate::failure::OrRaise as _;
 use crate::interpreter::call;
 use crate::letter::{self, Letter};
 use crate::message::{Content, Draft};
-use crate::pending::{Output, Pending, seconds};
+use crate::pending::{Output, Pending, begun, seconds};
 
 /// Time for a conversation, if the program sets none.
 pub(crate) const LONG: Duration = Duration::from_secs(365 * 24 * 60 * 60);
@@ -60,6 +61,15 @@ struct Led {
     events: BoxStream<'static, Result<RequestEvent, Failure>>,
     /// An answer that came where an agreement was asked for.
     answer: Option<Box<Message>>,
+}
+
+impl Led {
+    fn of(events: BoxStream<'static, Result<RequestEvent, Failure>>) -> Arc<Mutex<Self>> {
+        Arc::new(Mutex::new(Self {
+            events,
+            answer: None,
+        }))
+    }
 }
 
 #[pymethods]
@@ -106,6 +116,28 @@ async fn answered(led: Arc<Mutex<Led>>) -> Result<Box<Message>, Failure> {
     }
 }
 
+impl Agent {
+    /// Returns the events of a request that has not begun.
+    fn led(
+        &self,
+        message: &Bound<'_, PyAny>,
+        timeout: Option<f64>,
+        cancel: &Arc<Notify>,
+    ) -> PyResult<impl Stream<Item = Result<RequestEvent, Failure>> + Send + Unpin + use<>> {
+        let agent = self.registered(message.py())?;
+        let draft = Draft::read(message, Some(fipa::Performative::Request))?;
+        let timeout = seconds(timeout)?.unwrap_or(LONG);
+        let cancel = Arc::clone(cancel);
+        Ok(request(
+            agent.clone(),
+            draft.whole(agent)?,
+            &draft.act,
+            timeout,
+            cancel,
+        ))
+    }
+}
+
 impl std::fmt::Debug for Request {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Request").finish_non_exhaustive()
@@ -119,32 +151,20 @@ impl Agent {
     /// and `TimedOut` after `timeout` seconds.
     #[pyo3(signature = (message, *, timeout=None))]
     fn request(&self, message: &Bound<'_, PyAny>, timeout: Option<f64>) -> PyResult<Pending> {
-        let request = self.begin_request(message, timeout)?;
+        let events = self.led(message, timeout, &Arc::default())?;
+        let led = Led::of(events.boxed());
         Ok(Pending::lazy("Agent.request()", async move {
-            Ok(letter::output(*answered(request.led).await?))
+            Ok(letter::output(*answered(led).await?))
         }))
     }
 
-    /// Begins a request as `request`, for a program that cancels it or looks at the agreement.
+    /// Sends a request as `request` does, for a program that cancels it or looks at the agreement.
     #[pyo3(signature = (message, *, timeout=None))]
     fn begin_request(&self, message: &Bound<'_, PyAny>, timeout: Option<f64>) -> PyResult<Request> {
-        let agent = self.registered(message.py())?;
-        let draft = Draft::read(message, Some(fipa::Performative::Request))?;
-        let timeout = seconds(timeout)?.unwrap_or(LONG);
-        let cancel = Arc::<Notify>::default();
-        let events = request(
-            agent.clone(),
-            draft.whole(agent)?,
-            &draft.act,
-            timeout,
-            Arc::clone(&cancel),
-        );
-        let led = Led {
-            events: events.boxed(),
-            answer: None,
-        };
+        let cancel = Arc::default();
+        let events = self.led(message, timeout, &cancel)?;
         Ok(Request {
-            led: Arc::new(Mutex::new(led)),
+            led: Led::of(begun(events)),
             cancel,
         })
     }

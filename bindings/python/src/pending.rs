@@ -9,6 +9,10 @@ use std::time::{Duration, Instant};
 
 use fipa::blocking::Wait as _;
 use fipa_bindings::{Failure, FailureKind};
+use futures_core::Stream;
+use futures_core::stream::BoxStream;
+use futures_util::StreamExt as _;
+use futures_util::stream::once;
 use parking_lot::Mutex;
 use pyo3::exceptions::{
     PyRuntimeError, PyRuntimeWarning, PyStopAsyncIteration, PyStopIteration, PyValueError,
@@ -145,6 +149,18 @@ impl Pending {
 fn poll_once(future: &mut Waiting, waker: &Waker) -> Poll<Result<Option<Output>, Failure>> {
     let mut context = Context::from_waker(waker);
     poll_fn(|_| Poll::Ready(future.as_mut().poll(&mut context))).wait()
+}
+
+/// Begins an operation that emits events: its first letter is sent before the program waits.
+pub(crate) fn begun<T: Send + 'static>(
+    mut events: impl Stream<Item = T> + Send + Unpin + 'static,
+) -> BoxStream<'static, T> {
+    let mut context = Context::from_waker(Waker::noop());
+    let first = poll_fn(|_| Poll::Ready(events.poll_next_unpin(&mut context))).wait();
+    match first {
+        Poll::Ready(Some(event)) => once(async { event }).chain(events).boxed(),
+        Poll::Ready(None) | Poll::Pending => events.boxed(),
+    }
 }
 
 fn used() -> PyErr {

@@ -35,6 +35,18 @@ class Conversations(Loops):
         self.assertEqual((await request.result()).text, "lifted crate")
         lift.close()
 
+    async def test_a_request_begins_before_the_program_waits(self) -> None:
+        request = self.rover.begin_request(self.request("crate"), timeout=30)
+        letter = await self.arm.receive()
+        self.assertEqual(letter.text, "crate")
+        await self.arm.answer(letter, fipa.Message("agree"))
+        self.assertTrue(await request.agreed())
+
+    async def test_a_goal_begins_before_the_program_waits(self) -> None:
+        goal = self.rover.invoke(self.arm.name, "dig")
+        self.assertEqual((await self.arm.receive()).performative, "request")
+        del goal
+
     async def test_a_refusal_has_its_reason(self) -> None:
         @self.arm.serve("fipa-request")
         def lift(task: fipa.Task) -> None:
