@@ -43,7 +43,9 @@ class Loops(Case, unittest.IsolatedAsyncioTestCase):
 
 def program(source: str) -> subprocess.Popen:
     """Starts a program of its own in the same domain."""
-    source = "import sys, time, asyncio, threading, os, fipa\n" + textwrap.dedent(source)
+    # A shell has its background commands ignore Ctrl-C, which programs inherit.
+    start = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    source = start + "import sys, time, asyncio, threading, os, fipa\n" + textwrap.dedent(source)
     pipe = subprocess.PIPE
     return subprocess.Popen([sys.executable, "-c", source], stdin=pipe, stdout=pipe, stderr=pipe, text=True)
 
