@@ -7,7 +7,8 @@ use std::io::{BufRead as _, BufReader};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use support::{SANITIZERS, SHARED, Workshop, bindings, passes};
+use fipa_testbed::languages::bindings;
+use support::{SANITIZERS, SHARED, Workshop, passes};
 
 mod support;
 

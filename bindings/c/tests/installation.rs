@@ -8,7 +8,8 @@ use std::process::Command;
 
 use fipa_testbed::can_run;
 
-use support::{Workshop, bindings, library, passes};
+use fipa_testbed::languages::{bindings, libraries};
+use support::{Workshop, passes};
 
 mod support;
 
@@ -31,7 +32,7 @@ fn install(build: &Path, prefix: &Path) {
             .arg(build)
             .arg(define("CMAKE_INSTALL_PREFIX", prefix))
             .arg("-DCMAKE_INSTALL_LIBDIR=lib")
-            .arg(define("FIPA_LIBRARY_DIR", &library())),
+            .arg(define("FIPA_LIBRARY_DIR", &libraries())),
     );
     tool(Command::new("cmake").arg("--install").arg(build));
 }

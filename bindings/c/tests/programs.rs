@@ -8,7 +8,8 @@ use fipa::Performative;
 use fipa::blocking::Wait;
 use fipa_testbed::{ChildGuard, can_run, until};
 
-use support::{C, SHARED, STATIC, Workshop, bindings, run, run_sanitized};
+use fipa_testbed::languages::bindings;
+use support::{C, SHARED, STATIC, Workshop, run, run_sanitized};
 
 mod support;
 

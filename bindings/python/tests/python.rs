@@ -1,7 +1,6 @@
 //! Runs the tests in Python against the module that cargo has built for this test.
 
 use std::fs;
-use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -9,6 +8,7 @@ use fipa::blocking::Wait as _;
 use fipa::config::Sources;
 use fipa::{Config, Domain};
 use fipa_testbed::can_run;
+use fipa_testbed::languages::{install_package, python};
 
 /// The package, and the configuration of a domain of its own.
 struct Package(tempfile::TempDir);
@@ -16,19 +16,7 @@ struct Package(tempfile::TempDir);
 impl Package {
     fn new() -> Self {
         let dir = tempfile::tempdir().expect("a directory");
-        let to = dir.path().join("fipa");
-        fs::create_dir(&to).expect("a directory");
-        let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("fipa");
-        for source in fs::read_dir(sources).expect("the sources are there") {
-            let source = source.expect("an entry").path();
-            if source.is_file() {
-                let name = source.file_name().expect("a name");
-                fs::copy(&source, to.join(name)).expect("the source can be copied");
-            }
-        }
-        let test = std::env::current_exe().expect("the test has a path");
-        let module = test.with_file_name("libfipa_python.so");
-        symlink(module, to.join("_native.abi3.so")).expect("a link");
+        install_package(dir.path());
         let package = Self(dir);
         let runtime = package.0.path().join("run");
         let text = format!(
@@ -44,13 +32,13 @@ impl Package {
     }
 
     /// Returns a Python that finds the package.
-    fn python(&self) -> Command {
-        let mut python = Command::new("python3");
-        python
+    fn command(&self) -> Command {
+        let mut command = Command::new(python());
+        command
             .env("PYTHONPATH", self.0.path())
             .env("PYTHONDONTWRITEBYTECODE", "1")
             .env("FIPA_CONFIG", self.config());
-        python
+        command
     }
 }
 
@@ -72,19 +60,12 @@ impl Drop for Package {
 
 /// Runs the tests of a file.
 fn run(tests: &str) {
-    // The module is for CPython 3.11 and later versions.
-    let recent = "import sys; sys.exit(sys.version_info < (3, 11))";
-    let version = Command::new("python3").args(["-c", recent]).status();
-    let tool = match version.is_ok_and(|version| version.success()) {
-        true => "python3",
-        false => "python3.11",
-    };
-    if !can_run(tests, &[tool], true) {
+    if !can_run(tests, &[python()], true) {
         return;
     }
     let package = Package::new();
     let output = package
-        .python()
+        .command()
         .args([
             "-X",
             "faulthandler",
@@ -97,7 +78,7 @@ fn run(tests: &str) {
         ])
         .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests"))
         .output()
-        .expect("python3 runs");
+        .expect("python runs");
     let text = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{}\n{text}", output.status);
 }

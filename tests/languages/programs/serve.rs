@@ -15,7 +15,7 @@ use fipa_bindings::Failure;
 use serde::Deserialize;
 use tokio::sync::{Mutex, Notify};
 
-/// What the handlers of the server share.
+/// The state of the handlers.
 struct Shared {
     second: Agent,
     bay: Owned,

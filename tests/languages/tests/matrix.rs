@@ -5,7 +5,6 @@
 
 use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _};
-use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -14,6 +13,7 @@ use std::thread;
 use fipa::blocking::Wait as _;
 use fipa::config::Sources;
 use fipa::{Config, Domain};
+use fipa_testbed::languages::{compile, install_package, link_library, python};
 use fipa_testbed::{ChildGuard, can_run};
 
 /// Number of pairs that run at the same time.
@@ -36,19 +36,8 @@ struct Workshop(tempfile::TempDir);
 impl Workshop {
     fn new() -> Self {
         let dir = tempfile::tempdir().expect("a directory");
-        // The name under which the loader looks for the library.
-        let library = dir.path().join("libfipa.so.0");
-        symlink(built("libfipa_c.so"), library).expect("a link");
-        let package = dir.path().join("fipa");
-        fs::create_dir(&package).expect("a directory");
-        for source in fs::read_dir(here("../../bindings/python/fipa")).expect("the sources") {
-            let source = source.expect("an entry").path();
-            let name = source.file_name().expect("a name");
-            if source.is_file() {
-                fs::copy(&source, package.join(name)).expect("the source can be copied");
-            }
-        }
-        symlink(built("libfipa_python.so"), package.join("_native.abi3.so")).expect("a link");
+        link_library(dir.path());
+        install_package(dir.path());
         Self(dir)
     }
 
@@ -78,22 +67,9 @@ impl Workshop {
         let program = |role: &str| {
             let source = here("programs").join(role).with_extension(extension);
             let program = self.path().join(format!("{role}_{extension}"));
-            let compiled = Command::new(compiler)
-                .args(flags)
-                .args(["-O1", "-Wall", "-Wextra", "-Werror", "-pedantic"])
-                .arg("-I")
-                .arg(here("../../bindings/c/include"))
-                .arg("-I")
-                .arg(here("../../bindings/cpp/include"))
-                .arg(&source)
-                .arg("-o")
-                .arg(&program)
-                .arg("-L")
-                .arg(built(""))
-                .arg("-lfipa_c")
-                .status();
-            let compiled = compiled.expect("the compiler runs");
-            assert!(compiled.success(), "{}", source.display());
+            let warnings = ["-O1", "-Wall", "-Wextra", "-Werror", "-pedantic"];
+            let flags = [flags, &warnings].concat();
+            compile(compiler, &source, &program, &flags, &["-lfipa_c"]);
             vec![program]
         };
         Some(Language {
@@ -104,13 +80,7 @@ impl Workshop {
     }
 
     fn python() -> Option<Language> {
-        // The module is for CPython 3.11 and later versions.
-        let recent = "import sys; sys.exit(sys.version_info < (3, 11))";
-        let version = Command::new("python3").args(["-c", recent]).status();
-        let tool = match version.is_ok_and(|version| version.success()) {
-            true => "python3",
-            false => "python3.11",
-        };
+        let tool = python();
         let program = |file: &str| vec![tool.into(), here("programs").join(file)];
         can_run("the matrix with Python", &[tool], true).then(|| Language {
             name: "Python",
@@ -188,13 +158,6 @@ impl Drop for PairDomain {
 /// Returns a path of this package.
 fn here(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
-}
-
-/// Returns the path of a library that cargo has built for this test.
-fn built(library: &str) -> PathBuf {
-    let test = std::env::current_exe().expect("the test has a path");
-    let dir = test.parent().expect("the test is in target/debug/deps");
-    dir.join(library)
 }
 
 /// Returns a line without the random digits of conversation identifiers.

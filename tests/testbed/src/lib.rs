@@ -34,6 +34,7 @@
 
 mod avahi;
 mod child;
+pub mod languages;
 mod network;
 mod packet_repeater;
 mod peer;

@@ -2,7 +2,6 @@
 
 #![allow(dead_code, reason = "each file of tests uses a part")]
 
-use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -10,6 +9,7 @@ use std::process::Command;
 use fipa::blocking::Wait as _;
 use fipa::config::Sources;
 use fipa::{Config, Domain};
+use fipa_testbed::languages::{self, bindings, link_library};
 
 pub(crate) const SHARED: &[&str] = &["-lfipa_c"];
 pub(crate) const STATIC: &[&str] = &["-l:libfipa_c.a", "-lpthread", "-ldl", "-lm"];
@@ -25,19 +25,6 @@ pub(crate) const C: &[&str] = &[
     "-g",
 ];
 
-/// Returns the directory with the libraries that cargo has built for this test.
-pub(crate) fn library() -> PathBuf {
-    let test = env::current_exe().expect("the test has a path");
-    let parent = test.parent().expect("the test is in target/debug/deps");
-    parent.to_owned()
-}
-
-/// Returns the path of a file or a folder in `bindings`.
-pub(crate) fn bindings(path: &str) -> PathBuf {
-    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
-    here.parent().expect("bindings").join(path)
-}
-
 /// A directory for programs, with the configuration of a domain of their own.
 pub(crate) struct Workshop {
     dir: tempfile::TempDir,
@@ -51,9 +38,7 @@ impl Workshop {
             dir.path().join("run").display()
         );
         fs::write(dir.path().join("fipa.toml"), text).expect("the configuration can be written");
-        // The name under which the loader looks for the library.
-        let shared = dir.path().join("libfipa.so.0");
-        std::os::unix::fs::symlink(library().join("libfipa_c.so"), shared).expect("a link");
+        link_library(dir.path());
         Self { dir }
     }
 
@@ -83,26 +68,10 @@ impl Workshop {
         link: &[&str],
     ) -> PathBuf {
         let made = self.dir.path().join(name);
-        let compiled = Command::new(compiler)
-            .args(flags)
-            .arg(format!("-DVERSION=\"{}\"", env!("CARGO_PKG_VERSION")))
-            .args(cfg!(feature = "gateway").then_some("-DFIPA_GATEWAY"))
-            .arg("-I")
-            .arg(bindings("c/include"))
-            .arg("-I")
-            .arg(bindings("cpp/include"))
-            .arg(source)
-            .arg("-o")
-            .arg(&made)
-            .arg("-L")
-            .arg(library())
-            .args(link)
-            .status();
-        assert!(
-            compiled.expect("the compiler runs").success(),
-            "{compiler} {flags:?} {}",
-            source.display()
-        );
+        let version = format!("-DVERSION=\"{}\"", env!("CARGO_PKG_VERSION"));
+        let mut flags = [flags, &[&*version]].concat();
+        flags.extend(cfg!(feature = "gateway").then_some("-DFIPA_GATEWAY"));
+        languages::compile(compiler, source, &made, &flags, link);
         made
     }
 

@@ -1,0 +1,74 @@
+//! Programs in C, C++ and Python, against the libraries that cargo has built for a test.
+
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Returns the directory with the libraries that cargo has built for this test.
+#[must_use]
+pub fn libraries() -> PathBuf {
+    let test = std::env::current_exe().expect("the test has a path");
+    let parent = test.parent().expect("the test is in target/debug/deps");
+    parent.to_owned()
+}
+
+/// Returns the path of a file or a folder in `bindings`.
+#[must_use]
+pub fn bindings(path: &str) -> PathBuf {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2);
+    root.expect("the repository").join("bindings").join(path)
+}
+
+/// Links the library for C into a directory, under the name that the loader looks for.
+pub fn link_library(into: &Path) {
+    symlink(libraries().join("libfipa_c.so"), into.join("libfipa.so.0")).expect("a link");
+}
+
+/// Compiles a source with all headers and libraries in reach, and makes a program or what `flags` say.
+pub fn compile(compiler: &str, source: &Path, made: &Path, flags: &[&str], link: &[&str]) {
+    let compiled = Command::new(compiler)
+        .args(flags)
+        .arg("-I")
+        .arg(bindings("c/include"))
+        .arg("-I")
+        .arg(bindings("cpp/include"))
+        .arg(source)
+        .arg("-o")
+        .arg(made)
+        .arg("-L")
+        .arg(libraries())
+        .args(link)
+        .status();
+    assert!(
+        compiled.expect("the compiler runs").success(),
+        "{compiler} {flags:?} {}",
+        source.display()
+    );
+}
+
+/// Returns the command of a Python that can load the module, which is for CPython 3.11 and later versions.
+#[must_use]
+pub fn python() -> &'static str {
+    let recent = "import sys; sys.exit(sys.version_info < (3, 11))";
+    let version = Command::new("python3").args(["-c", recent]).status();
+    match version.is_ok_and(|version| version.success()) {
+        true => "python3",
+        false => "python3.11",
+    }
+}
+
+/// Puts the package `fipa` for Python into a directory, with the module that cargo has built.
+pub fn install_package(into: &Path) {
+    let to = into.join("fipa");
+    fs::create_dir(&to).expect("a directory");
+    for source in fs::read_dir(bindings("python/fipa")).expect("the sources are there") {
+        let source = source.expect("an entry").path();
+        if source.is_file() {
+            let name = source.file_name().expect("a name");
+            fs::copy(&source, to.join(name)).expect("the source can be copied");
+        }
+    }
+    let module = libraries().join("libfipa_python.so");
+    symlink(module, to.join("_native.abi3.so")).expect("a link");
+}
