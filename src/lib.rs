@@ -136,6 +136,8 @@ pub use agent::sender_tasks::SenderTasks;
 pub use agent::{Agent, Loan, Unread};
 pub use any_error::{Error, Result};
 pub use config::Config;
+#[cfg(feature = "shm")]
+pub use domain::ContentCounts;
 pub use domain::coalition::Coalition;
 pub use domain::directory_view::DirectoryView;
 pub use domain::{Domain, Follower, RegisterOptions};
@@ -152,5 +154,7 @@ pub use fipa_sds::{
 pub use fipa_transport::{Attempt, FailureReason, Incarnation, Kind, Location, Outcome, Signature};
 #[doc(hidden)]
 pub use fipa_transport::{fnv1a, log_limit, threads};
+#[cfg(feature = "shm")]
+pub use fipa_transport_shm::is_in_place;
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbor, SelfCheck, SelfCheckError};

@@ -107,6 +107,18 @@ impl fmt::Debug for Domain {
     }
 }
 
+/// Numbers of contents that have arrived through shared memory: see [`Domain::content_counts`].
+#[cfg(feature = "shm")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+#[non_exhaustive]
+pub struct ContentCounts {
+    /// Contents that are read in the memory of their sender.
+    pub in_place: u64,
+    /// Contents that were copied, because the process already held as many in place as it may: 15 of one sender, 256 of
+    /// all. A program that reads a letter and drops it has none.
+    pub copied: u64,
+}
+
 /// Reads the configuration of a domain again, from the sources that the program has given.
 #[derive(Debug, Clone)]
 pub struct Follower {
@@ -285,6 +297,17 @@ impl Domain {
     pub fn routes(&self, to: &Query) -> RouteReport {
         let entries = report::agents(&*self.inner.service.host, to);
         self.inner.service.report(&entries)
+    }
+
+    /// Counts the contents of at least 1 KiB that have arrived through shared memory, since the domain was opened.
+    #[cfg(feature = "shm")]
+    #[must_use]
+    pub fn content_counts(&self) -> ContentCounts {
+        let counters = self.inner.service.shm_counters();
+        ContentCounts {
+            in_place: counters.in_place,
+            copied: counters.copied_full,
+        }
     }
 
     /// Applies another configuration without losing a letter. The order of the transports, the exceptions from it, the

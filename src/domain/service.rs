@@ -3,6 +3,8 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+#[cfg(feature = "shm")]
+use std::sync::Weak;
 use std::time::Duration;
 
 use fipa_acl::ErrorChain;
@@ -10,6 +12,8 @@ use fipa_mts::core::{CoreConfig, RouteException};
 use fipa_mts::{AccessGate, Contacts, Mts, RuntimeConfig, Started};
 use fipa_sds::{Cancellation, Directory, Entry, HostDirectory, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Signature, Transport, log_limit};
+#[cfg(feature = "shm")]
+use fipa_transport_shm::{ShmCounters, ShmTransport};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -52,6 +56,8 @@ pub(crate) struct Service {
     /// The task that serves the watchers.
     watching: JoinHandle<()>,
     maintenance: JoinHandle<()>,
+    #[cfg(feature = "shm")]
+    shm: Option<Weak<ShmTransport>>,
     /// The task that logs changes of the directory, if these lines are logged.
     changes: Option<JoinHandle<()>>,
     /// The runtime of the background tasks.
@@ -164,6 +170,8 @@ impl Service {
             changes,
             watching,
             locations: mts.locations(),
+            #[cfg(feature = "shm")]
+            shm: maintenance.shm.clone(),
             maintenance: handle.spawn(maintenance.run()),
             mts,
             host,
@@ -333,6 +341,13 @@ impl Service {
         self.watchers.reload_requests()
     }
 
+    /// Returns the counters of shared memory; zeros if the process does not use it.
+    #[cfg(feature = "shm")]
+    pub(crate) fn shm_counters(&self) -> ShmCounters {
+        let shm = self.shm.as_ref().and_then(Weak::upgrade);
+        shm.map_or_else(ShmCounters::default, |shm| shm.counters())
+    }
+
     /// Waits for letters in transit, at most [`CLOSING_TIMEOUT`], and ends the service.
     pub(crate) async fn close(&self) {
         self.mts.close(CLOSING_TIMEOUT).await;
@@ -495,7 +510,7 @@ impl TransportParts<'_> {
 
     #[cfg(feature = "shm")]
     fn shm(&mut self) -> Result<Arc<dyn Transport>, String> {
-        use fipa_transport_shm::{ShmConfig, ShmTransport};
+        use fipa_transport_shm::ShmConfig;
         let settings = &self.config.transport.shm;
         let config = ShmConfig {
             capacity: settings.capacity,

@@ -1,20 +1,40 @@
 //! Content that is read in place, and the slots of its senders that it holds.
 
-use std::sync::Arc;
+use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Weak};
 
+use fipa_transport::log_limit;
 use parking_lot::Mutex;
 
 use crate::ShmConfig;
-use crate::counters::Tally;
+use crate::counters::{Tally, count_alone};
 use crate::layout::{ANSWERS, Active, UninitAck};
 use crate::memory::MappedPtr;
 use crate::peer_segments::{PeerSegments, SegmentContent};
-use crate::presence::Doorbell;
+use crate::presence::{Doorbell, Presence};
 
 /// Maximum number of late answers to all senders together. The others remain for parcels that are
 /// answered at once.
 const MAX_LATE_ANSWERS: usize = ANSWERS / 2;
+
+/// Number of contents that are copied, without a release between them, before the program is told. A burst is no reason:
+/// it waits in the queue of an agent, which releases its letters one after the other.
+const COPIES_BEFORE_WARNING: u32 = 64;
+
+/// The endpoints of this process: an address says nothing about the endpoint that has it.
+static ENDPOINTS: Mutex<Vec<Weak<BorrowLimits>>> = Mutex::new(Vec::new());
+
+/// Whether this process reads these bytes in place, in shared memory of the process that sent them. Such content takes
+/// one of a bounded number of places; other content is a copy of its own.
+#[must_use]
+pub fn is_in_place(content: &[u8]) -> bool {
+    // The last reference to an endpoint removes its files: not under this lock.
+    let endpoints: Vec<_> = ENDPOINTS.lock().iter().filter_map(Weak::upgrade).collect();
+    let address = content.as_ptr().addr();
+    let has = |limits: &Arc<BorrowLimits>| limits.held.lock().contains(address);
+    !content.is_empty() && endpoints.iter().any(has)
+}
 
 /// The owner of a request: this value alone, or the handed-out content.
 pub(crate) enum RequestOwner {
@@ -38,6 +58,8 @@ pub(crate) struct HeldRequest {
     /// `Some` until this is dropped.
     pub(crate) active: Mutex<Option<Active>>,
     pub(crate) sender: u128,
+    /// The address of the content.
+    pub(crate) content: usize,
     pub(crate) borrows: Arc<BorrowLimits>,
 }
 
@@ -57,7 +79,7 @@ impl Drop for HeldRequest {
         }
         // The memory first, then the count: a slot that counts as free must be free.
         drop(active);
-        self.borrows.end(self.sender);
+        self.borrows.end(self.sender, self.content);
     }
 }
 
@@ -92,7 +114,8 @@ impl AsRef<[u8]> for BorrowedSegmentContent {
 
 impl Drop for BorrowedSegmentContent {
     fn drop(&mut self) {
-        let _held = self.borrows.held.lock();
+        let mut held = self.borrows.held.lock();
+        held.forget(self.as_ref().as_ptr().addr());
         self.borrows.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
     }
 }
@@ -119,9 +142,32 @@ pub(crate) struct HeldSlots {
     of: Vec<(u128, usize)>,
     /// Number of late answers to all senders.
     late: usize,
+    /// The addresses of the contents that are held. An address is there twice if two agents have its content.
+    contents: Vec<Range<usize>>,
+    /// Number of contents that were copied since the last release.
+    copies: u32,
 }
 
 impl HeldSlots {
+    fn contains(&self, address: usize) -> bool {
+        let mut contents = self.contents.iter();
+        contents.any(|content| content.contains(&address))
+    }
+
+    fn remember(&mut self, content: &[u8]) {
+        let start = content.as_ptr().addr();
+        self.contents.push(start..start + content.len());
+    }
+
+    /// Forgets a content that is released.
+    fn forget(&mut self, start: usize) {
+        // The newest is mostly the first to be released.
+        if let Some(place) = self.contents.iter().rposition(|one| one.start == start) {
+            self.contents.swap_remove(place);
+        }
+        self.copies = 0;
+    }
+
     fn count(&self, sender: u128) -> usize {
         let mut of = self.of.iter();
         of.find(|(one, _)| *one == sender)
@@ -149,28 +195,59 @@ impl HeldSlots {
 }
 
 impl BorrowLimits {
-    /// Counts one more content in a segment, which takes no slot of its sender. False at the limit.
-    pub(crate) fn begin_segment(&self) -> bool {
-        let _held = self.held.lock();
-        let few = self.tally.borrowed.load(Ordering::Relaxed) < self.total as u64;
-        if few {
-            self.tally.borrowed.fetch_add(1, Ordering::Relaxed);
-        }
-        few
+    pub(crate) fn create(
+        config: &ShmConfig,
+        presence: &Presence,
+        tally: Arc<Tally>,
+        peer_segments: Arc<PeerSegments>,
+    ) -> Arc<Self> {
+        let limits = Arc::new(Self {
+            per_sender: config.window - 1,
+            late_per_sender: config.window / 2,
+            total: config.max_borrowed,
+            held: Mutex::default(),
+            waiting: AtomicBool::new(false),
+            doorbell: presence.doorbell().clone(),
+            tally,
+            peer_segments,
+        });
+        let mut endpoints = ENDPOINTS.lock();
+        endpoints.retain(|endpoint| endpoint.strong_count() > 0);
+        endpoints.push(Arc::downgrade(&limits));
+        limits
     }
 
-    /// Counts one more content of this sender, if a slot stays free for its next letter.
-    pub(crate) fn begin(&self, sender: u128) -> bool {
+    /// Counts one more content in a segment, which takes no slot of its sender. False at the limit: the content is then
+    /// copied.
+    pub(crate) fn begin_segment(&self, content: &[u8]) -> bool {
+        self.begin_if(content, |_| true)
+    }
+
+    /// Counts one more content of this sender, if a slot stays free for its next letter. If not, the content is copied.
+    pub(crate) fn begin(&self, sender: u128, content: &[u8]) -> bool {
+        self.begin_if(content, |held| held.begin(sender, self.per_sender))
+    }
+
+    fn begin_if(&self, content: &[u8], begin: impl FnOnce(&mut HeldSlots) -> bool) -> bool {
         let mut held = self.held.lock();
         // Changed only under the lock.
-        if self.tally.borrowed.load(Ordering::Relaxed) >= self.total as u64 {
-            return false;
-        }
-        let begun = held.begin(sender, self.per_sender);
-        if begun {
+        let few = self.tally.borrowed.load(Ordering::Relaxed) < self.total as u64;
+        if few && begin(&mut held) {
             self.tally.borrowed.fetch_add(1, Ordering::Relaxed);
+            held.remember(content);
+            return true;
         }
-        begun
+        held.copies = held.copies.saturating_add(1);
+        let warn = held.copies == COPIES_BEFORE_WARNING;
+        drop(held);
+        count_alone(&self.tally.copied_full);
+        if warn {
+            let (each, all) = (self.per_sender, self.total);
+            log_limit::warn!(
+                "the program keeps the content of letters: {COPIES_BEFORE_WARNING} further contents were copied. A process reads at most {each} contents of one sender in place, and {all} of all; release a letter when it has been read, and copy what is kept"
+            );
+        }
+        false
     }
 
     /// Counts one more late answer to this sender, if fewer than half of its slots are held without
@@ -195,9 +272,10 @@ impl BorrowLimits {
         self.drain_again();
     }
 
-    fn end(&self, sender: u128) {
+    fn end(&self, sender: u128, content: usize) {
         let mut held = self.held.lock();
         held.end(sender);
+        held.forget(content);
         self.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
         drop(held);
         self.drain_again();

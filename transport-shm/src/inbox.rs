@@ -2,7 +2,7 @@
 
 use std::ptr::NonNull;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 
 use bytes::Bytes;
 use fipa_transport::wire::ParcelHeader;
@@ -128,16 +128,7 @@ impl Inbox {
             server,
             deferred: config.answers_late.then_some(deferred),
             service_hash: service.service_hash().as_str().to_owned(),
-            borrows: Arc::new(BorrowLimits {
-                per_sender: config.window - 1,
-                late_per_sender: config.window / 2,
-                total: config.max_borrowed,
-                held: Mutex::default(),
-                waiting: AtomicBool::new(false),
-                doorbell: presence.doorbell().clone(),
-                tally: tally.clone(),
-                peer_segments,
-            }),
+            borrows: BorrowLimits::create(config, presence, tally.clone(), peer_segments),
             page: Arc::clone(presence.page()),
             account: Account::default(),
             tally,
@@ -374,7 +365,7 @@ impl Inbox {
             return (parcel, RequestOwner::Unshared(active));
         }
         let content = &payload[offsets.content..offsets.tail];
-        let (parcel, owner) = if self.try_begin_borrow(content.len(), &active) {
+        let (parcel, owner) = if self.try_begin_borrow(content, &active) {
             // Front and tail, copied into one allocation.
             let around = [
                 &payload[offsets.start..offsets.content],
@@ -383,7 +374,8 @@ impl Inbox {
             let mut front = Bytes::from(around.concat());
             let tail = front.split_off(offsets.content - offsets.start);
             let bytes = MappedPtr(NonNull::from(content));
-            let request = self.hold(active);
+            let address = content.as_ptr().addr();
+            let request = self.hold(active, address);
             let content = Bytes::from_owner(BorrowedContent {
                 bytes,
                 _request: Arc::clone(&request),
@@ -416,8 +408,7 @@ impl Inbox {
                 }
                 ReadError::NoRoom => Answer::Busy,
             })?;
-        if !self.borrows.begin_segment() {
-            count_alone(&self.tally.copied_full);
+        if !self.borrows.begin_segment(content.as_ref()) {
             return Ok(Bytes::copy_from_slice(content.as_ref()));
         }
         count_alone(&self.tally.in_place);
@@ -428,27 +419,23 @@ impl Inbox {
     }
 
     /// Whether content is handed out in place. If so, it is counted as held.
-    fn try_begin_borrow(&self, len: usize, active: &Active) -> bool {
-        let small = len < self.copy_below;
-        if !small && self.borrows.begin(active.origin().value()) {
-            return true;
+    fn try_begin_borrow(&self, content: &[u8], active: &Active) -> bool {
+        if content.len() >= self.copy_below && !content.is_empty() {
+            return self.borrows.begin(active.origin().value(), content);
         }
-        if len > 0 {
-            count_alone(if small {
-                &self.tally.copied_small
-            } else {
-                &self.tally.copied_full
-            });
+        if !content.is_empty() {
+            count_alone(&self.tally.copied_small);
         }
         false
     }
 
     /// Holds a request whose content is handed out in place. [`Self::try_begin_borrow`] must have
     /// returned true for it.
-    fn hold(&self, active: Active) -> Arc<HeldRequest> {
+    fn hold(&self, active: Active, content: usize) -> Arc<HeldRequest> {
         count_alone(&self.tally.in_place);
         Arc::new(HeldRequest {
             sender: active.origin().value(),
+            content,
             active: Mutex::new(Some(active)),
             borrows: self.borrows.clone(),
         })

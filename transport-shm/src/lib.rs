@@ -8,6 +8,7 @@
 //! * [`ShmTransport`] is the transport, [`ShmConfig`] its configuration.
 //! * [`cleanup_dead`] removes the files of killed processes. Every endpoint also does so by itself.
 //!   [`inspect`] reports on a domain without changing it.
+//! * [`is_in_place`] tells whether content is read without a copy.
 //! * [`ShmCounters`] counts parcels, copies and their reasons.
 //!
 //! | module | content |
@@ -82,6 +83,7 @@ mod transport;
 mod variant;
 mod wakeup;
 
+pub use borrowed::is_in_place;
 pub use config::{ShmConfig, ShmError};
 pub use counters::ShmCounters;
 pub use domain_files::{Cleaned, cleanup_dead};

@@ -8,6 +8,7 @@ use bytes::Bytes;
 use common::{FRONT, TestDomain, attempt, mapping_of, open, parcel};
 use fipa_testbed::until;
 use fipa_transport::{Answer, Conclusion, Transport, TransportErrorKind};
+use fipa_transport_shm::is_in_place;
 
 fn pattern(len: usize) -> Bytes {
     (0..len)
@@ -185,8 +186,12 @@ fn held_content_is_bounded_and_then_copied() {
         (5, 35, 5)
     );
     for number in 0..40 {
-        assert_eq!(got.content(number), pattern(3000 + number));
+        let content = got.content(number);
+        assert_eq!(content, pattern(3000 + number));
+        assert_eq!(is_in_place(&content), number < 5, "{number}");
+        assert_eq!(is_in_place(&content[1000..]), number < 5, "{number}");
     }
+    assert!(!is_in_place(&[]));
     got.arrived.lock().unwrap().clear();
     assert_eq!(receiver.counters().borrowed, 0);
     sender.post(attempt(), &to, parcel(pattern(3000))).unwrap();

@@ -443,6 +443,24 @@ typedef struct fipa_domain_options {
 } fipa_domain_options;
 
 /*
+ Numbers of contents of at least 1 KiB that have arrived through shared memory.
+ */
+typedef struct fipa_content_counts {
+  /*
+   sizeof(struct fipa_content_counts).
+   */
+  size_t size;
+  /*
+   Contents that are read in shared memory of their sender.
+   */
+  uint64_t in_place;
+  /*
+   Contents that were copied, because the program held too many in place.
+   */
+  uint64_t copied;
+} fipa_content_counts;
+
+/*
  An item of a queue.
  */
 typedef struct fipa_item {
@@ -513,6 +531,11 @@ typedef struct fipa_letter_info {
    How the message violates its protocol, if `monitor.check` is `warn` or `enforce`. Empty if it does not.
    */
   struct fipa_text violation;
+  /*
+   Whether the content is read in shared memory of the sender: 1, or 0. A process has a bounded number of such
+   contents: at most 15 of one sender. It gets copies of further ones.
+   */
+  int32_t in_place;
 } fipa_letter_info;
 
 /*
@@ -902,6 +925,14 @@ fipa_result fipa_agents(fipa_handle domain,
 fipa_result fipa_routes(fipa_handle domain,
                         struct fipa_text pattern,
                         fipa_handle *routes);
+
+/*
+ Counts the contents that have arrived through shared memory since the domain was opened.
+
+ # Safety
+ `counts` is NULL, or its first field is the number of bytes that can be written there.
+ */
+fipa_result fipa_read_content_counts(fipa_handle domain, struct fipa_content_counts *counts);
 
 /*
  Follows the directory: each agent that joins, changes or leaves is an item of the kind `FIPA_EVENT_CHANGE`, with a

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 use crate::failure::{FipaResult, call};
 use crate::item::{Event, FipaEvent, Items, OperationHandle, Text};
-use crate::raw::{Extensible, FipaText, Place, Readable, structure, texts};
+use crate::raw::{Extensible, FipaText, Place, Readable, fill, structure, texts};
 use crate::table::{self, FipaHandle, Object};
 
 /// How a process joins a domain. A field that is zero is not set.
@@ -153,6 +153,44 @@ pub unsafe extern "C" fn fipa_routes(
         };
         let report = membership.domain.routes(&query);
         Ok(table::give(routes, Text::json(&report)?))
+    })
+}
+
+/// Numbers of contents of at least 1 KiB that have arrived through shared memory.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct FipaContentCounts {
+    /// sizeof(struct fipa_content_counts).
+    pub size: usize,
+    /// Contents that are read in shared memory of their sender.
+    pub in_place: u64,
+    /// Contents that were copied, because the program held too many in place.
+    pub copied: u64,
+}
+
+// SAFETY: It begins with a `usize`.
+unsafe impl Extensible for FipaContentCounts {}
+
+/// Counts the contents that have arrived through shared memory since the domain was opened.
+///
+/// # Safety
+/// `counts` is NULL, or its first field is the number of bytes that can be written there.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fipa_read_content_counts(
+    domain: FipaHandle,
+    counts: *mut FipaContentCounts,
+) -> FipaResult {
+    call(|| {
+        let membership = table::get::<Membership>(domain)?;
+        let found = membership.domain.content_counts();
+        let found = FipaContentCounts {
+            size: size_of::<FipaContentCounts>(),
+            in_place: found.in_place,
+            copied: found.copied,
+        };
+        // SAFETY: The caller promises it.
+        unsafe { fill(counts, found, "the counts") }?;
+        Ok(FipaResult::Ok)
     })
 }
 

@@ -5,7 +5,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
 use fipa::protocol::Notification;
-use fipa::{AgentId, Incoming, Kind, Message, Time};
+use fipa::{AgentId, Incoming, Kind, Message, Time, is_in_place};
 
 use crate::raw::{Extensible, FipaBytes, FipaText, Readable};
 
@@ -83,6 +83,9 @@ pub struct FipaLetterInfo {
     pub via: FipaText,
     /// How the message violates its protocol, if `monitor.check` is `warn` or `enforce`. Empty if it does not.
     pub violation: FipaText,
+    /// Whether the content is read in shared memory of the sender: 1, or 0. A process has a bounded number of such
+    /// contents: at most 15 of one sender. It gets copies of further ones.
+    pub in_place: i32,
 }
 
 // SAFETY: It begins with a `usize`.
@@ -149,13 +152,17 @@ impl Letter {
         }
     }
 
-    pub(crate) fn content(&self) -> FipaBytes {
+    fn bytes(&self) -> Option<&[u8]> {
         let content = self.content.get_or_init(|| match &self.source {
             // Without decoding the other parameters.
             Source::Incoming(incoming) => incoming.content(),
             Source::Message(message) => message.content().cloned(),
         });
-        content.as_deref().map_or(FipaBytes::NONE, FipaBytes::of)
+        content.as_deref()
+    }
+
+    pub(crate) fn content(&self) -> FipaBytes {
+        self.bytes().map_or(FipaBytes::NONE, FipaBytes::of)
     }
 
     fn lists(&self) -> &Lists {
@@ -190,6 +197,7 @@ impl Letter {
             size: size_of::<FipaLetterInfo>(),
             via: FipaText::of_option(incoming.and_then(|it| it.via).map(Kind::name)),
             violation: FipaText::of_option(violation.as_deref()),
+            in_place: self.bytes().is_some_and(is_in_place).into(),
         }
     }
 

@@ -697,6 +697,9 @@ class readable : public handle<Owner> {
   [[nodiscard]] std::string_view violation() const& noexcept { return view(info().violation); }
   /// A text of a temporary object would be invalid at once.
   std::string_view violation() const&& = delete;
+  /// Returns whether the content is read in shared memory of the sender. A process has a bounded
+  /// number of such contents: at most 15 of one sender. It gets copies of further ones.
+  [[nodiscard]] bool in_place() const noexcept { return info().in_place != 0; }
 
  protected:
   readable() noexcept = default;
@@ -1513,6 +1516,13 @@ class domain : public detail::handle<domain> {
     fipa_handle report = 0;
     const auto code = fipa_routes(raw(), detail::text(pattern), &report);
     return detail::owned<json>(code, report);
+  }
+  /// Counts the contents of at least 1 KiB that have arrived through shared memory.
+  [[nodiscard]] result<fipa_content_counts> content_counts() const {
+    auto counts = detail::sized<fipa_content_counts>();
+    const auto code = fipa_read_content_counts(raw(), &counts);
+    if (code != FIPA_RESULT_OK) return detail::last(code);
+    return counts;
   }
   /// Makes changes of the directory items of the kind `event::change`, until the operation is
   /// destroyed.

@@ -254,7 +254,9 @@ static void loans(const fipa::domain& domain, const fipa::agent& rover, const fi
   CHECK(!loan && loan.data() == nullptr && loan.size() == 0);
   CHECK(loan.send().error().code() == errc::bad_handle);
   auto letter = take(arm.receive(step));
-  CHECK(letter && letter->content().size() == size);
+  CHECK(letter && letter->content().size() == size && letter->in_place());
+  const auto counts = take(domain.content_counts());
+  CHECK(counts.in_place > 0 && counts.copied == 0);
   const auto content = letter->content();
   CHECK(std::count(content.begin(), content.end(), std::byte{7}) == 1'000'000);
 

@@ -102,7 +102,7 @@ impl Domain {
         };
         let mut found = self.opened.get(py)?.agents();
         found.retain(|entry| query.matches(entry));
-        listed(py, &found)
+        plain(py, &found)
     }
 
     /// Returns the routes of letters to the agents of a pattern.
@@ -112,7 +112,13 @@ impl Domain {
             name: matcher(py, pattern)?,
             ..Query::all()
         };
-        listed(py, &self.opened.get(py)?.routes(&query))
+        plain(py, &self.opened.get(py)?.routes(&query))
+    }
+
+    /// Counts the contents of at least 1 KiB that have arrived through shared memory, as a dictionary. Those that are read
+    /// there are `in_place`; those that were copied, because the program held too many in place, are `copied`.
+    fn content_counts(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        plain(py, &self.opened.get(py)?.content_counts())
     }
 
     /// Follows the directory: dictionaries with `change` (`"joined"`, `"changed"` or `"left"`) and `agent`. The change is
@@ -154,7 +160,7 @@ fn matcher(py: Python<'_>, text: Option<&str>) -> PyResult<Option<Matcher>> {
     text.map(Matcher::parse).transpose().or_fail().or_raise(py)
 }
 
-fn listed(py: Python<'_>, values: &impl Serialize) -> PyResult<Py<PyAny>> {
+fn plain(py: Python<'_>, values: &impl Serialize) -> PyResult<Py<PyAny>> {
     let values = serde_json::to_value(values);
     let values = values.map_err(|error| Failure::new(FailureKind::Failed, error.to_string()));
     to_python(py, &values.or_raise(py)?)

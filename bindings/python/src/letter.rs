@@ -236,6 +236,13 @@ impl Letter {
         })
     }
 
+    /// Whether the content is read in shared memory of the sender. A process has a bounded number of such contents: at most
+    /// 15 of one sender. It gets copies of further ones.
+    #[getter]
+    fn in_place(&self) -> PyResult<bool> {
+        Ok(fipa::is_in_place(&self.source()?.content()))
+    }
+
     /// How the message violates its protocol, if `monitor.check` is `warn` or `enforce`.
     #[getter]
     fn violation(&self) -> PyResult<Option<String>> {

@@ -176,6 +176,13 @@ class Memory(Case):
         letter.release()
         self.assertEqual(array.sum(), 2.5 * 100_000)
 
+    def test_a_letter_says_whether_its_content_is_in_place(self) -> None:
+        for content, in_place in [(b"", False), (b"x" * 100, False), (b"x" * 10_000, True)]:
+            self.rover.send(self.inform(content)).wait()
+            with self.arm.receive().wait(timeout=30) as letter:
+                self.assertEqual(letter.in_place, in_place, len(content))
+        self.assertEqual(self.domain.content_counts(), {"in_place": 1, "copied": 0})
+
     def test_hundreds_of_views_do_not_stop_the_other_receivers(self) -> None:
         views = []
         for number in range(300):
@@ -183,6 +190,58 @@ class Memory(Case):
             views.append(self.arm.receive().wait(timeout=30).content)
         for number, view in enumerate(views):
             self.assertEqual(view[:4], number.to_bytes(4, "big"))
+
+    def test_a_program_that_keeps_images_gets_copies_and_slows_no_other_one(self) -> None:
+        count = times(200, 1_000)
+        camera, viewer = f"camera_{count}", f"viewer_{count}"
+        filming = program(f"""
+            with fipa.Domain() as domain:
+                agent = domain.register("{camera}").wait()
+                with agent.publisher("image") as images:
+                    print("ready", flush=True)
+                    while images.subscribers < 2:
+                        time.sleep(0.01)
+                    due = time.monotonic()
+                    for number in range({count}):
+                        loan = images.loan(1_000_000)
+                        with memoryview(loan) as view:
+                            view[:4] = view[-4:] = number.to_bytes(4, "big")
+                        loan.publish().wait()
+                        due += 1 / 30
+                        time.sleep(max(0, due - time.monotonic()))
+                    sys.stdin.read()
+        """)
+        self.addCleanup(filming.communicate)
+        self.assertEqual(filming.stdout.readline(), "ready\n")
+        viewing = program(f"""
+            with fipa.Domain() as domain:
+                agent = domain.register("{viewer}").wait()
+                images = agent.subscribe("{camera}", "image", keep="all")
+                in_place = 0
+                for number in range({count}):
+                    with next(images) as image:
+                        assert image.missed == 0 and image.content[:4] == number.to_bytes(4, "big")
+                        in_place += image.in_place
+                assert in_place > {count} / 2, in_place
+        """)
+        kept = []
+        with self.assertLogs("fipa", "WARNING") as logs:
+            with self.rover.subscribe(camera, "image", keep="all") as images:
+                while len(kept) < count:
+                    kept.append(next(images))
+            # The lines of the library are delivered by the calls of the program.
+            self.domain.agents()
+        finished(self, viewing)
+        for number, image in enumerate(kept):
+            self.assertEqual((image.missed, image.content[-4:]), (0, number.to_bytes(4, "big")))
+        in_place = sum(image.in_place for image in kept)
+        counts = self.domain.content_counts()
+        # A content that the sender has repeated has arrived once, and is counted each time.
+        self.assertGreaterEqual(counts["copied"], count - in_place)
+        self.assertGreater(in_place, 14)
+        self.assertLess(in_place, count)
+        lines = [line for line in logs.output if "keeps the content of letters" in line]
+        self.assertEqual(len(lines), 1, logs.output)
 
     def test_letters_do_not_leak(self) -> None:
         def pages() -> int:

@@ -58,6 +58,7 @@ static void letters(void) {
   info.size = sizeof info;
   OK(fipa_read_info(letter, &info));
   CHECK(info.violation.len == 0);
+  CHECK(is(info.via, "shm") && info.in_place == 0);
 
   lift = message("confirm", NULL, "done");
   OK(fipa_answer(arm, letter, &lift, -1, NULL));
@@ -88,8 +89,13 @@ static void loans(void) {
   fipa_message image = message("inform", &to, NULL);
   fipa_handle loan, letter;
   fipa_bytes content;
+  fipa_letter_info info;
+  fipa_content_counts before, counts;
   uint8_t *memory;
 
+  before.size = counts.size = sizeof counts;
+  info.size = sizeof info;
+  OK(fipa_read_content_counts(domain, &before));
   OK(fipa_loan(rover, &image, len, &loan, &memory));
   memset(memory, 7, len);
   OK(fipa_send_loan(loan, -1, NULL));
@@ -97,6 +103,9 @@ static void loans(void) {
   OK(fipa_receive(arm, LONG, &letter));
   OK(fipa_read_content(letter, &content));
   CHECK(content.len == len && content.data[0] == 7 && content.data[len - 1] == 7);
+  OK(fipa_read_info(letter, &info));
+  OK(fipa_read_content_counts(domain, &counts));
+  CHECK(info.in_place == 1 && counts.in_place == before.in_place + 1 && counts.copied == 0);
   OK(fipa_close(letter));
 
   OK(fipa_loan(rover, &image, 10, &loan, &memory));

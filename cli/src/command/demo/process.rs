@@ -13,6 +13,7 @@ use fipa::locks::{Fence, Lock, OwnOptions, Owned, with_fences};
 use fipa::monitor::Library;
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, Gateway, Incoming, Performative, Reach, fnv1a,
+    is_in_place,
 };
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -112,8 +113,8 @@ pub(super) struct Received {
     /// The content if it is text of at most 1024 bytes.
     pub(super) content: Option<String>,
     pub(super) len: usize,
-    /// Whether the content is in the shared memory of the domain.
-    pub(super) in_shared_memory: bool,
+    /// Whether the content is read in shared memory of its sender.
+    pub(super) in_place: bool,
     /// Whether the content has the checksum that was sent with it; none without a checksum.
     pub(super) intact: Option<bool>,
 }
@@ -453,27 +454,9 @@ fn received_message(incoming: &Incoming) -> Received {
         via: incoming.via.map(|kind| kind.to_string()),
         content: (content.len() <= 1024).then(text).flatten(),
         len: content.len(),
-        in_shared_memory: is_in_shared_memory(&content),
+        in_place: is_in_place(&content),
         intact: sent.map(|(_, sent)| *sent == format!("{:016x}", fnv1a(content.iter().copied()))),
     }
-}
-
-/// Whether these bytes are in a mapping of the domain's shared memory, according to the kernel.
-fn is_in_shared_memory(bytes: &[u8]) -> bool {
-    let address = bytes.as_ptr() as usize;
-    let maps = std::fs::read_to_string("/proc/self/maps").unwrap_or_default();
-    maps.lines()
-        .filter(|line| line.contains("/dev/shm/fipa_"))
-        .any(|line| {
-            let range = line
-                .split(' ')
-                .next()
-                .and_then(|range| range.split_once('-'));
-            range.is_some_and(|(from, to)| {
-                let number = |text| usize::from_str_radix(text, 16).unwrap_or(0);
-                (number(from)..number(to)).contains(&address)
-            })
-        })
 }
 
 /// The participant's side of fipa-request (FIPA00026): agree, then inform of the result.

@@ -333,7 +333,7 @@ impl Demo {
             ensure!(seen.len == LARGE, "{to} received {} bytes", seen.len);
             ensure!(seen.intact == Some(true), "{to}: wrong checksum");
             ensure!(
-                !in_place || seen.in_shared_memory,
+                !in_place || seen.in_place,
                 "the content is in the private memory of {to}: it was copied"
             );
             let place = if in_place {
@@ -344,7 +344,7 @@ impl Demo {
             self.say(&format!(
                 "  {to} received 4 MiB via {via}{place}; the checksum is correct"
             ));
-            routes.push(json!({ "receiver": to, "via": via, "in_place": seen.in_shared_memory }));
+            routes.push(json!({ "receiver": to, "via": via, "in_place": seen.in_place }));
         }
         found!("via": "shm", "bytes": LARGE, "ways": routes)
     }
