@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message};
 use fipa_mts::core::Received;
+use fipa_transport::Incarnation;
 
 /// Time for which a letter waits for the entry of its sender.
 const WAIT: Duration = Duration::from_secs(5);
@@ -20,6 +21,9 @@ const MAX_OF_PEER: usize = 8;
 
 /// Maximum length of a waiting letter, in bytes. Requests to the agents of the gateway are shorter.
 const MAX_LEN: usize = 16 * 1024;
+
+/// A sender: its registration, which a legacy peer does not tell, and the name that it claims.
+pub(super) type Author = (Incarnation, Option<String>);
 
 /// A letter to an agent of the gateway, with what was read from it.
 pub(super) struct Early {
@@ -45,6 +49,11 @@ impl Early {
             until: now + WAIT,
         }
     }
+
+    pub(super) fn author(&self) -> Author {
+        let name = self.message.sender().map(|id| id.name().to_owned());
+        (self.received.sender, name)
+    }
 }
 
 /// The waiting letters, in the order in which they arrived.
@@ -67,6 +76,14 @@ impl EarlyLetters {
         is_kept
     }
 
+    /// Takes the letters of an author, because its next letter has arrived.
+    pub(super) fn take_of(&mut self, author: &Author) -> VecDeque<Early> {
+        let all = self.take().into_iter();
+        let (of_author, others) = all.partition(|letter| letter.author() == *author);
+        self.0 = others;
+        of_author
+    }
+
     /// Takes all letters, because an entry may have arrived or the time of a letter is over.
     pub(super) fn take(&mut self) -> VecDeque<Early> {
         std::mem::take(&mut self.0)
@@ -82,11 +99,32 @@ impl EarlyLetters {
 mod tests {
     use std::time::SystemTime;
 
+    use bytes::Bytes;
     use fipa_acl::Performative;
     use fipa_mts::letter_for;
-    use fipa_transport::{Incarnation, PeerId};
+    use fipa_transport::PeerId;
 
     use super::*;
+
+    #[test]
+    fn the_letters_of_an_author_are_taken_in_their_order() {
+        let now = Instant::now();
+        let mut early = EarlyLetters::default();
+        for (sender, content) in [(1, 10), (2, 11), (1, 12)] {
+            let mut one = letter(now, 1, content);
+            one.received.sender = Incarnation::from_u64(sender);
+            assert!(early.keep(now, one));
+        }
+        let lengths = |letters: VecDeque<Early>| -> Vec<_> {
+            let content = |it: &Early| it.message.content().map(Bytes::len);
+            letters.iter().map(content).collect()
+        };
+        assert_eq!(
+            lengths(early.take_of(&letter(now, 1, 1).author())),
+            [Some(10), Some(12)]
+        );
+        assert_eq!(lengths(early.take()), [Some(11)]);
+    }
 
     fn letter(at: Instant, peer: u8, content: usize) -> Early {
         let message = Message::builder(Performative::Request)

@@ -4,7 +4,7 @@
 //! Each of the two is an agent of this host with a name, a queue and a directory entry of its own. The
 //! descriptions in the directory facilitators of gateways travel with the exchange of their directories.
 
-use std::collections::HashSet;
+use std::collections::{HashSet, VecDeque};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -488,20 +488,33 @@ impl Task {
             }
         };
         let now = now();
-        self.answer(now, Early::new(now.at, message, received, asked));
+        let letter = Early::new(now.at, message, received, asked);
+        let mut letters = self.early.take_of(&letter.author());
+        letters.push_back(letter);
+        self.answer_or_keep(now, letters);
     }
 
     /// Handles the letters whose senders may be in the directory now.
     fn handle_early(&mut self) {
-        let now = now();
-        for letter in self.early.take() {
-            self.answer(now, letter);
-        }
+        let letters = self.early.take();
+        self.answer_or_keep(now(), letters);
     }
 
-    /// Answers a letter, or keeps it until its sender is in the directory.
-    fn answer(&mut self, now: PlatformTime, letter: Early) {
-        let Some(mut asker) = self.means.asker(&letter.message, &letter.received) else {
+    /// Answers letters, or keeps them until their senders are in the directory.
+    fn answer_or_keep(&mut self, now: PlatformTime, letters: VecDeque<Early>) {
+        // The entry of a sender may arrive meanwhile: its later letters do not overtake one that is kept.
+        let mut absent = HashSet::new();
+        for letter in letters {
+            let author = letter.author();
+            let asker = match absent.contains(&author) {
+                true => None,
+                false => self.means.asker(&letter.message, &letter.received),
+            };
+            if let Some(asker) = asker {
+                self.answer(now, asker, letter);
+                continue;
+            }
+            absent.insert(author);
             if !self.early.keep(now.at, letter) {
                 let agent = self.own.name();
                 log_limit::info!(
@@ -509,8 +522,10 @@ impl Task {
                     "cannot answer a letter: its sender is not registered"
                 );
             }
-            return;
-        };
+        }
+    }
+
+    fn answer(&mut self, now: PlatformTime, mut asker: Asker, letter: Early) {
         asker.asked = letter.asked;
         match &mut self.core {
             Core::Ams(ams) => {
