@@ -1086,6 +1086,35 @@ fipa_result fipa_read_content(fipa_handle letter,
 fipa_result fipa_read_info(fipa_handle letter, struct fipa_letter_info *info);
 
 /*
+ Lists a service of an agent in the directory facilitator of the host, or replaces its service of the same name.
+ `service` is a JSON object with a `type`, and optionally a `name` (if it is missing, the type), `ownership`,
+ `protocols`, `ontologies`, `languages` (arrays of texts) and `properties` (an object). Waits for the answer.
+
+ # Safety
+ The text must be readable.
+ */
+fipa_result fipa_register_service(fipa_handle agent,
+                                  struct fipa_text service);
+
+/*
+ Removes all services of an agent from the directory facilitator, except its topics. Waits for the answer.
+ */
+fipa_result fipa_deregister_services(fipa_handle agent);
+
+/*
+ Searches for agents with a service, of this host and of those that its gateway knows. `pattern` is a JSON object as
+ for `fipa_register_service`, of which each part is optional, and may have the `agent`; an empty text finds all. The
+ value of a property is null if any will do. Waits for the answer: a JSON array of objects with `name`, `services`,
+ `protocols`, `ontologies`, `languages` and `lease`.
+
+ # Safety
+ The text must be readable. `found` is NULL or can be written.
+ */
+fipa_result fipa_search_services(fipa_handle agent,
+                                 struct fipa_text pattern,
+                                 fipa_handle *found);
+
+/*
  Publishes a topic: accepts the subscriptions whose content is its name (FIPA00035). `fipa_close` ends it.
 
  # Safety

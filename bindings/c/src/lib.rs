@@ -17,6 +17,7 @@ mod loaned;
 mod locks;
 mod message;
 mod raw;
+mod services;
 mod table;
 mod topics;
 
@@ -35,6 +36,7 @@ pub use crate::letter::{FipaLetterInfo, FipaMessage, FipaParameter};
 pub use crate::locks::*;
 pub use crate::message::*;
 pub use crate::raw::FipaText;
+pub use crate::services::*;
 pub use crate::table::FipaHandle;
 pub use crate::topics::*;
 

@@ -1277,6 +1277,22 @@ class agent : public detail::handle<agent> {
         fipa_begin_lock(raw(), names.data(), names.size(), within.milliseconds(), tag, &begun);
     return detail::owned<operation>(code, begun);
   }
+  /// Lists a service in the directory facilitator, and waits for the answer. `service` is a JSON
+  /// object with a `type`: see `fipa_register_service`.
+  [[nodiscard]] result<void> register_service(std::string_view service) const {
+    return detail::checked(fipa_register_service(raw(), detail::text(service)));
+  }
+  /// Removes all services from the directory facilitator, except topics. Waits for the answer.
+  [[nodiscard]] result<void> deregister_services() const {
+    return detail::checked(fipa_deregister_services(raw()));
+  }
+  /// Searches for agents with a service, and waits for the answer, a JSON array. `pattern` is empty,
+  /// or a JSON object: see `fipa_search_services`.
+  [[nodiscard]] result<json> search_services(std::string_view pattern = {}) const {
+    fipa_handle found = 0;
+    const auto code = fipa_search_services(raw(), detail::text(pattern), &found);
+    return detail::owned<json>(code, found);
+  }
   /// Founds a coalition: one name for these agents. `options` is as for `own`.
   [[nodiscard]] result<coalition> found_coalition(std::string_view name, const texts& members,
                                                   const own_options& options = {}) const {

@@ -620,10 +620,22 @@ static void coalitions(const fipa::domain& domain, const fipa::agent& rover,
 }
 
 #if defined(FIPA_GATEWAY)
-static void gateways(const std::string_view config) {
+static void services(const fipa::agent& rover, const fipa::agent& arm) {
+  CHECK(arm.register_service(R"({"type": "lift"})"));
+  auto found = take(rover.search_services(R"({"type": "lift"})"));
+  CHECK(has(found.view(), R"("name":"arm")"));
+  CHECK(arm.deregister_services());
+  found = take(rover.search_services());
+  CHECK(!has(found.view(), "lift"));
+  CHECK(rover.search_services("{").error().code() == errc::invalid);
+}
+
+static void gateways(const std::string_view config, const fipa::agent& rover,
+                     const fipa::agent& arm) {
   const std::array<std::string_view, 1> set{"discovery.mdns=false"};
   auto gateway = take(fipa::gateway::open({config, set}));
   CHECK(has(fipa::gateway::open({config, set}).error().text(), "already running"));
+  services(rover, arm);
   CHECK(gateway.close());
 }
 #endif
@@ -649,7 +661,7 @@ int main(int argc, char** argv) {
   locks(domain, rover, arm, argv[2]);
   coalitions(domain, rover, arm, argv[2]);
 #if defined(FIPA_GATEWAY)
-  gateways(argv[1]);
+  gateways(argv[1], rover, arm);
 #endif
 
   // The end of an agent ends what waits for it.

@@ -143,6 +143,30 @@ class Agent:
         keep: str | None = None,
         timeout: float | None = None,
     ) -> Events[Letter]: ...
+    def register_service(
+        self,
+        type: str,
+        name: str | None = None,
+        *,
+        properties: Mapping[str, Any] = ...,
+        protocols: Sequence[str] = ...,
+        ontologies: Sequence[str] = ...,
+        languages: Sequence[str] = ...,
+        ownership: str | None = ...,
+    ) -> Pending[None]: ...
+    def deregister_services(self) -> Pending[None]: ...
+    def search_services(
+        self,
+        type: str | None = None,
+        name: str | None = None,
+        *,
+        agent: str | None = ...,
+        properties: Mapping[str, Any] = ...,
+        protocols: Sequence[str] = ...,
+        ontologies: Sequence[str] = ...,
+        languages: Sequence[str] = ...,
+        ownership: str | None = ...,
+    ) -> Pending[list[dict[str, Any]]]: ...
     def lock(self, *resources: str, timeout: float | None = None) -> Pending[Lock]: ...
     def own(
         self,

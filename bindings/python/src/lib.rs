@@ -21,6 +21,7 @@ mod log;
 mod membership;
 mod message;
 mod pending;
+mod services;
 mod topics;
 mod value;
 mod wakeups;

@@ -6,7 +6,7 @@ use std::process::Command;
 
 use fipa::blocking::Wait as _;
 use fipa::config::Sources;
-use fipa::{Config, Domain};
+use fipa::{Config, Domain, Gateway};
 use fipa_testbed::can_run;
 use fipa_testbed::languages::{install_package, python};
 
@@ -58,12 +58,15 @@ impl Drop for Package {
     }
 }
 
-/// Runs the tests of a file.
+/// Runs the tests of a file in a domain of their own.
 fn run(tests: &str) {
+    run_in(&Package::new(), tests);
+}
+
+fn run_in(package: &Package, tests: &str) {
     if !can_run(tests, &[python()], true) {
         return;
     }
-    let package = Package::new();
     let output = package
         .command()
         .args([
@@ -96,6 +99,20 @@ fn messages() {
 #[test]
 fn protocols() {
     run("test_protocols");
+}
+
+/// The directory facilitator is an agent of the gateway.
+#[test]
+fn services() {
+    let package = Package::new();
+    let mut sources = Sources::from_environment();
+    sources.file = Some(package.config());
+    let here = ["discovery.mdns=false", "mts.transports=shm,unix"];
+    sources.set.extend(here.map(str::to_owned));
+    let config = Config::load(&sources).expect("the configuration is right");
+    let gateway = Gateway::open(&config).wait().expect("a gateway");
+    run_in(&package, "test_services");
+    gateway.close().wait();
 }
 
 #[test]

@@ -6,6 +6,7 @@ use std::fmt;
 use fipa::actions::ActionError;
 use fipa::error::{OpenError, ReceiveError, RegisterError, SendError};
 use fipa::locks::LockError;
+use fipa::platform::PlatformError;
 use fipa::protocol::DialogueError;
 
 /// The kind of a failure.
@@ -110,8 +111,11 @@ fn kind_of(error: &fipa::Error) -> FailureKind {
         return FailureKind::Forked;
     }
     match error {
-        Error::Dialogue(error) | Error::Action(ActionError::Dialogue(error)) => dialogue(error),
-        Error::Action(ActionError::Refused(_) | ActionError::Failed(_)) => FailureKind::Refused,
+        Error::Dialogue(error)
+        | Error::Action(ActionError::Dialogue(error))
+        | Error::Platform(PlatformError::Dialogue(error)) => dialogue(error),
+        Error::Action(ActionError::Refused(_) | ActionError::Failed(_))
+        | Error::Platform(PlatformError::Rejected(_)) => FailureKind::Refused,
         Error::Send(error) => send(error),
         Error::Receive(ReceiveError::Closed) => FailureKind::Closed,
         Error::Lock(error) => lock(error),

@@ -63,6 +63,8 @@ pub struct Options {
     pub program: Vec<OsString>,
     /// The program of the items, if it is another one.
     pub item: Option<Vec<OsString>>,
+    /// The program of the operator, if it is another one.
+    pub operator: Option<Vec<OsString>>,
 }
 
 /// The result of a run.
@@ -313,7 +315,11 @@ impl Run<'_> {
             fault: self.options.fault,
             mutant: self.options.mutant,
         };
-        let own = self.options.item.as_ref().filter(|_| role == Role::Item);
+        let own = match role {
+            Role::Item => self.options.item.as_ref(),
+            Role::Operator => self.options.operator.as_ref(),
+            _ => None,
+        };
         let program = own.unwrap_or(&self.options.program);
         let (program, arguments) = program.split_first().ok_or("no program")?;
         let mut child = Command::new(program)

@@ -3,11 +3,15 @@
 
 #![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
+use std::path::Path;
+
 use fipa_reconfiguration::Fault;
 use fipa_reconfiguration::launch::{self, Link, Options, Outcome};
 use fipa_reconfiguration::part::Mutant;
 use fipa_reconfiguration::picture;
 use fipa_reconfiguration::report::Claim;
+use fipa_testbed::can_run;
+use fipa_testbed::languages::{install_package, python};
 
 /// A run of the program of this package.
 fn options(fault: Option<Fault>, seed: u64) -> Options {
@@ -57,6 +61,40 @@ async fn two_robots_become_one() {
     for text in ["payload_2", "crex_stack, leader", "sherpa #1", "confirm"] {
         assert!(drawn.contains(text), "{text}");
     }
+}
+
+/// The operator is the program in Python.
+#[tokio::test]
+async fn the_operator_may_be_a_program_in_python() {
+    if !can_run("the operator in Python", &[python()], true) {
+        return;
+    }
+    let package = tempfile::tempdir().unwrap();
+    install_package(package.path());
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let packages = format!("PYTHONPATH={}", package.path().display());
+    let operator = here.join("operator.py");
+    let operator = [
+        "env".into(),
+        packages.into(),
+        python().into(),
+        operator.into_os_string(),
+    ];
+    let outcome = run(Options {
+        operator: Some(operator.into()),
+        ..options(None, 1)
+    })
+    .await;
+    assert!(outcome.failed.is_empty(), "{:?}", outcome.failed);
+    let docked = |claim: &Claim| matches!(claim, Claim::Docked { .. });
+    assert_eq!(
+        outcome
+            .reports
+            .iter()
+            .filter(|it| docked(&it.claim))
+            .count(),
+        2
+    );
 }
 
 #[tokio::test]

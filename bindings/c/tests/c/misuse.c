@@ -50,6 +50,12 @@ static void wrong_pointers(fipa_handle domain, fipa_handle agent) {
   BAD(fipa_send(agent, &sent, -1, NULL));
   sent = message("inform", &to, NULL);
   REFUSED(fipa_send(agent, &sent, -1, (fipa_handle *)((char *)&handle + 1)));
+  REFUSED(fipa_register_service(agent, missing));
+  REFUSED(fipa_register_service(agent, invalid));
+  REFUSED(fipa_register_service(agent, text("[]")));
+  REFUSED(fipa_search_services(agent, invalid, &handle));
+  REFUSED(fipa_search_services(agent, text(""), NULL));
+  BAD(fipa_deregister_services(domain));
   REFUSED(fipa_next(domain, 0, NULL));
   memset(&item, 0, sizeof item);
   REFUSED(fipa_next(domain, 0, &item));

@@ -541,6 +541,22 @@ static void coalitions(const char *state_dir) {
 }
 
 #ifdef FIPA_GATEWAY
+static void services(void) {
+  fipa_handle found;
+  fipa_text json;
+  OK(fipa_register_service(arm, text("{\"type\": \"lift\", \"properties\": {\"kg\": 12}}")));
+  OK(fipa_search_services(rover, text("{\"type\": \"lift\", \"properties\": {\"kg\": null}}"), &found));
+  OK(fipa_read_text(found, &json));
+  CHECK(has(json, "\"name\":\"arm\"") && has(json, "{\"kg\":12}"));
+  OK(fipa_close(found));
+  OK(fipa_deregister_services(arm));
+  CHECK(fipa_deregister_services(arm) == FIPA_RESULT_REFUSED);
+  OK(fipa_search_services(rover, text(""), &found));
+  OK(fipa_read_text(found, &json));
+  CHECK(!has(json, "lift"));
+  OK(fipa_close(found));
+}
+
 static void gateway(const char *config) {
   fipa_text set = text("discovery.mdns=false"), json;
   fipa_handle opened, second, agents;
@@ -555,6 +571,7 @@ static void gateway(const char *config) {
   CHECK(has(fipa_error(), "already running"));
   OK(fipa_close(opened));
   OK(fipa_open_gateway(&options, &opened));
+  services();
   OK(fipa_close(opened));
   OK(fipa_agents(domain, text("rover"), text(""), &agents));
   OK(fipa_read_text(agents, &json));
@@ -581,6 +598,10 @@ int main(int argc, char **argv) {
   topics();
   locks(argv[2]);
   coalitions(argv[2]);
+  /* Without a gateway, the host has no directory facilitator. */
+  CHECK(fipa_search_services(rover, text(""), &letter) == FIPA_RESULT_FAILED);
+  CHECK(has(fipa_error(), "fipa up"));
+  CHECK(fipa_register_service(rover, text("{\"kind\": 1}")) == FIPA_RESULT_INVALID);
 #ifdef FIPA_GATEWAY
   gateway(argv[1]);
 #endif

@@ -34,6 +34,7 @@ use crate::report::Failure;
 #[command(
     after_help = "Examples:\n  fipa demo dock\n  fipa demo dock --fault master-stopped --svg dock.svg\n  \
                   fipa demo dock --fault random --seed 7\n  \
+                  fipa demo dock --operator examples/reconfiguration/operator.py\n  \
                   fipa demo dock --json | jq '.reports[] | select(.claim == \"noticed\")'\n\nJSON:\n  \
                   { \"fault\", \"seed\", \"passed\": [checks], \"failed\": [checks with reasons],\n    \
                   \"reports\": [ { \"at\" in microseconds since 1970, \"by\", \"claim\", its details } ] }"
@@ -60,6 +61,9 @@ pub(crate) struct Arguments {
     /// The program of the items, which runs instead of this one
     #[arg(long, hide = true, value_name = "PROGRAM")]
     item: Option<OsString>,
+    /// The program of the operator, which runs instead of this one, with its part as JSON
+    #[arg(long, value_name = "PROGRAM")]
+    operator: Option<OsString>,
     /// A defect that is built in
     #[arg(long, hide = true, value_parser = mutant)]
     mutant: Option<Mutant>,
@@ -103,6 +107,7 @@ pub(super) fn run(arguments: Arguments) -> Result<(), Failure> {
         mutant: arguments.mutant,
         program: launch::own_program(&["demo", "dock", "--part"]).map_err(failed)?,
         item: arguments.item.map(|program| vec![program]),
+        operator: arguments.operator.map(|program| vec![program]),
     };
     // A file that cannot be written is an error before the run, not after it.
     if let Some(file) = &arguments.svg {
