@@ -60,7 +60,7 @@ impl Drop for Package {
 
 /// Runs the tests of a file.
 fn run(tests: &str) {
-    if !can_run(tests, &[python()], true) {
+    if !can_run(tests, &[&python()], true) {
         return;
     }
     let package = Package::new();

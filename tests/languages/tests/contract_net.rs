@@ -3,14 +3,9 @@
 
 #![allow(clippy::expect_used, reason = "a failed precondition fails the test")]
 
-use std::io::{BufRead as _, BufReader, Write as _};
-use std::process::{ChildStdin, Command, Stdio};
-use std::sync::mpsc::{Receiver, channel};
 use std::thread;
-use std::time::Duration;
 
-use common::{Language, RunDomain, Workshop};
-use fipa_testbed::ChildGuard;
+use common::{Language, Process, RunDomain, Workshop};
 
 mod common;
 
@@ -18,54 +13,10 @@ mod common;
 const ROLES: [&str; 2] = ["bid", "call"];
 const BID: usize = 0;
 const CALL: usize = 1;
-/// Time after which a program hangs. No run takes a tenth of it.
-const WATCHDOG: Duration = Duration::from_secs(200);
 /// The positions of the carriers. Those at opposite corners are out of reach of each other.
 const CORNERS: [(f64, f64); 4] = [(3.0, 3.0), (-3.0, 3.0), (-3.0, -3.0), (3.0, -3.0)];
 /// Distance up to which a carrier makes a proposal.
 const REACH: f64 = 6.0;
-
-/// A process that reads and writes lines.
-struct Process {
-    name: String,
-    guard: ChildGuard,
-    input: ChildStdin,
-    lines: Receiver<String>,
-}
-
-impl Process {
-    fn start(name: &str, command: &mut Command) -> Self {
-        let mut guard = ChildGuard::start(command.stdin(Stdio::piped()).stdout(Stdio::piped()));
-        let input = guard.child().stdin.take().expect("its input");
-        let output = guard.child().stdout.take().expect("its output");
-        let (found, lines) = channel();
-        thread::spawn(move || {
-            for line in BufReader::new(output).lines().map_while(Result::ok) {
-                // The test may have ended.
-                let _ = found.send(line);
-            }
-        });
-        let process = Self {
-            name: name.to_owned(),
-            guard,
-            input,
-            lines,
-        };
-        process.prints("ready");
-        process
-    }
-
-    fn reads(&mut self, line: &str) {
-        writeln!(self.input, "{line}").unwrap_or_else(|error| panic!("{}: {error}", self.name));
-    }
-
-    /// Waits for the next line.
-    #[track_caller]
-    fn prints(&self, expected: &str) {
-        let line = self.lines.recv_timeout(WATCHDOG);
-        assert_eq!(line.as_deref(), Ok(expected), "{}", self.name);
-    }
-}
 
 /// Starts a carrier per language in a domain of its own, and has the leader call for proposals.
 fn run(workshop: &Workshop, languages: &[Language], leading: usize) {
@@ -73,13 +24,16 @@ fn run(workshop: &Workshop, languages: &[Language], leading: usize) {
     let start = |(language, (x, y)): (&Language, &(f64, f64))| {
         let name = format!("carrier_{}", language.extension);
         let mut command = domain.command(workshop, &language.programs[BID]);
-        Process::start(&name, command.args([&name, &x.to_string(), &y.to_string()]))
+        let carrier = Process::start(&name, command.args([&name, &x.to_string(), &y.to_string()]));
+        carrier.prints("ready");
+        carrier
     };
     let mut carriers: Vec<Process> = languages.iter().zip(&CORNERS).map(start).collect();
     let leader = &languages[leading];
     let mut command = domain.command(workshop, &leader.programs[CALL]);
     let name = format!("the operator in {}", leader.name);
     let mut operator = Process::start(&name, command.arg("operator"));
+    operator.prints("ready");
     let all: Vec<usize> = (0..carriers.len()).collect();
 
     for nearest in &all {
@@ -103,9 +57,7 @@ fn run(workshop: &Workshop, languages: &[Language], leading: usize) {
     operator.reads("go on");
     awarded(&operator, &carriers, &proposals);
 
-    drop(operator.input);
-    let status = operator.guard.wait();
-    assert!(status.success(), "{name}: {status}");
+    operator.ends();
 }
 
 /// Calls for a crate near a corner, waits for the answers, and returns the carriers that make proposals, the nearest

@@ -3,14 +3,21 @@
 #![allow(dead_code, reason = "each file of tests uses a part")]
 
 use std::fs;
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::thread;
+use std::time::Duration;
 
 use fipa::blocking::Wait as _;
 use fipa::config::Sources;
 use fipa::{Config, Domain};
-use fipa_testbed::can_run;
 use fipa_testbed::languages::{compile, install_package, link_library, python};
+use fipa_testbed::{ChildGuard, can_run};
+
+/// Time after which a process hangs. No run takes a tenth of it.
+const WATCHDOG: Duration = Duration::from_secs(200);
 
 /// A language, and the commands of its programs.
 pub(crate) struct Language {
@@ -38,8 +45,6 @@ impl Workshop {
 
     /// Returns the languages that this machine has, with the programs of these roles.
     pub(crate) fn languages(&self, test: &str, roles: &[&str]) -> Vec<Language> {
-        let c = ["-std=c99", "-D_POSIX_C_SOURCE=200809L"];
-        let cpp = ["-std=c++17", "-Wshadow", "-Wconversion"];
         let rust = Path::new(env!("CARGO_BIN_EXE_languages_serve"));
         let rust = |role: &&str| vec![rust.with_file_name(format!("languages_{role}"))];
         let rust = Language {
@@ -47,9 +52,9 @@ impl Workshop {
             extension: "rs",
             programs: roles.iter().map(rust).collect(),
         };
-        let compiled = |name, tool: &str, extension, flags: &[&str]| {
+        let compiled = |name, tool: &str, extension| {
             can_run(&format!("{test} with {name}"), &[tool], true).then(|| {
-                let program = |role: &&str| vec![self.compiled(tool, role, extension, flags)];
+                let program = |role: &&str| vec![self.compiled(&source(role, extension))];
                 Language {
                     name,
                     extension,
@@ -58,18 +63,18 @@ impl Workshop {
             })
         };
         let tool = python();
-        let python = can_run(&format!("{test} with Python"), &[tool], true).then(|| Language {
+        let python = can_run(&format!("{test} with Python"), &[&tool], true).then(|| Language {
             name: "Python",
             extension: "py",
             programs: roles
                 .iter()
-                .map(|role| vec![tool.into(), source(role, "py")])
+                .map(|role| vec![PathBuf::from(&tool), source(role, "py")])
                 .collect(),
         });
         [
             Some(rust),
-            compiled("C", "cc", "c", &c),
-            compiled("C++", "c++", "cpp", &cpp),
+            compiled("C", "cc", "c"),
+            compiled("C++", "c++", "cpp"),
             python,
         ]
         .into_iter()
@@ -77,13 +82,25 @@ impl Workshop {
         .collect()
     }
 
-    /// Compiles a program with warnings as errors.
-    fn compiled(&self, tool: &str, role: &str, extension: &str, flags: &[&str]) -> PathBuf {
-        let program = self.path().join(format!("{role}_{extension}"));
-        let warnings = ["-O1", "-Wall", "-Wextra", "-Werror", "-pedantic"];
-        let flags = [flags, &warnings].concat();
-        let link = ["-lfipa_c", "-lm"];
-        compile(tool, &source(role, extension), &program, &flags, &link);
+    /// Compiles a program in C or C++ with warnings as errors.
+    pub(crate) fn compiled(&self, source: &Path) -> PathBuf {
+        let is_c = source.extension().is_some_and(|extension| extension == "c");
+        let (tool, flags) = match is_c {
+            true => ("cc", ["-std=c99", "-D_POSIX_C_SOURCE=200809L"]),
+            false => ("c++", ["-std=c++17", "-Wconversion"]),
+        };
+        let name = source.file_name().expect("a name").to_string_lossy();
+        let program = self.path().join(name.replace('.', "_"));
+        let warnings = [
+            "-O1",
+            "-Wall",
+            "-Wextra",
+            "-Werror",
+            "-pedantic",
+            "-Wshadow",
+        ];
+        let flags = [&flags[..], &warnings].concat();
+        compile(tool, source, &program, &flags, &["-lfipa_c", "-lm"]);
         program
     }
 }
@@ -150,6 +167,63 @@ impl Drop for RunDomain {
             let domain = Domain::open(&config).wait().expect("a domain");
             domain.close().wait();
         }
+    }
+}
+
+/// A process that reads and writes lines.
+pub(crate) struct Process {
+    pub(crate) name: String,
+    pub(crate) guard: ChildGuard,
+    lines: Receiver<String>,
+}
+
+impl Process {
+    pub(crate) fn start(name: &str, command: &mut Command) -> Self {
+        let mut guard = ChildGuard::start(command.stdin(Stdio::piped()).stdout(Stdio::piped()));
+        let output = guard.child().stdout.take().expect("its output");
+        let (found, lines) = channel();
+        thread::spawn(move || {
+            for line in BufReader::new(output).lines().map_while(Result::ok) {
+                // The test may have ended.
+                let _ = found.send(line);
+            }
+        });
+        Self {
+            name: name.to_owned(),
+            guard,
+            lines,
+        }
+    }
+
+    /// Writes a line to its standard input.
+    pub(crate) fn reads(&mut self, line: &str) {
+        let input = self.guard.child().stdin.as_mut().expect("its input");
+        writeln!(input, "{line}").unwrap_or_else(|error| panic!("{}: {error}", self.name));
+    }
+
+    /// Returns the next line of its standard output; none at the end.
+    pub(crate) fn line(&self) -> Option<String> {
+        match self.lines.recv_timeout(WATCHDOG) {
+            Ok(line) => Some(line),
+            Err(RecvTimeoutError::Disconnected) => None,
+            Err(RecvTimeoutError::Timeout) => panic!("{} hangs", self.name),
+        }
+    }
+
+    /// Waits for the next line.
+    #[track_caller]
+    pub(crate) fn prints(&self, expected: &str) {
+        assert_eq!(self.line().as_deref(), Some(expected), "{}", self.name);
+    }
+
+    /// Closes its standard input, and waits for its end without an error. Returns the other lines.
+    #[track_caller]
+    pub(crate) fn ends(mut self) -> Vec<String> {
+        drop(self.guard.child().stdin.take());
+        let lines = std::iter::from_fn(|| self.line()).collect();
+        let status = self.guard.wait();
+        assert!(status.success(), "{}: {status}", self.name);
+        lines
     }
 }
 
