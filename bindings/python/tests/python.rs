@@ -7,8 +7,7 @@ use std::process::Command;
 use fipa::blocking::Wait as _;
 use fipa::config::Sources;
 use fipa::{Config, Domain};
-use fipa_testbed::can_run;
-use fipa_testbed::languages::{install_package, python};
+use fipa_testbed::languages::{can_import, install_package, python};
 
 /// The package, and the configuration of a domain of its own.
 struct Package(tempfile::TempDir);
@@ -58,9 +57,9 @@ impl Drop for Package {
     }
 }
 
-/// Runs the tests of a file.
-fn run(tests: &str) {
-    if !can_run(tests, &[&python()], true) {
+/// Runs the tests of a file, which need these modules.
+fn run(tests: &str, modules: &[&str]) {
+    if !can_import(tests, modules) {
         return;
     }
     let package = Package::new();
@@ -85,20 +84,25 @@ fn run(tests: &str) {
 
 #[test]
 fn examples() {
-    run("test_examples");
+    run("test_examples", &[]);
 }
 
 #[test]
 fn messages() {
-    run("test_messages");
+    run("test_messages", &[]);
+}
+
+#[test]
+fn plot() {
+    run("test_plot", &["matplotlib"]);
 }
 
 #[test]
 fn protocols() {
-    run("test_protocols");
+    run("test_protocols", &[]);
 }
 
 #[test]
 fn waiting() {
-    run("test_waiting");
+    run("test_waiting", &[]);
 }
