@@ -7,8 +7,7 @@ use std::process::Command;
 use fipa::blocking::Wait as _;
 use fipa::config::Sources;
 use fipa::{Config, Domain, Gateway};
-use fipa_testbed::can_run;
-use fipa_testbed::languages::{install_package, python};
+use fipa_testbed::languages::{can_import, install_package, python};
 
 /// The package, and the configuration of a domain of its own.
 struct Package(tempfile::TempDir);
@@ -58,15 +57,14 @@ impl Drop for Package {
     }
 }
 
-/// Runs the tests of a file in a domain of their own.
-fn run(tests: &str) {
-    run_in(&Package::new(), tests);
+/// Runs the tests of a file, which need these modules, in a domain of their own.
+fn run(tests: &str, modules: &[&str]) {
+    if can_import(tests, modules) {
+        run_in(&Package::new(), tests);
+    }
 }
 
 fn run_in(package: &Package, tests: &str) {
-    if !can_run(tests, &[python()], true) {
-        return;
-    }
     let output = package
         .command()
         .args([
@@ -88,22 +86,30 @@ fn run_in(package: &Package, tests: &str) {
 
 #[test]
 fn examples() {
-    run("test_examples");
+    run("test_examples", &[]);
 }
 
 #[test]
 fn messages() {
-    run("test_messages");
+    run("test_messages", &[]);
+}
+
+#[test]
+fn plot() {
+    run("test_plot", &["matplotlib"]);
 }
 
 #[test]
 fn protocols() {
-    run("test_protocols");
+    run("test_protocols", &[]);
 }
 
 /// The directory facilitator is an agent of the gateway.
 #[test]
 fn services() {
+    if !can_import("test_services", &[]) {
+        return;
+    }
     let package = Package::new();
     let mut sources = Sources::from_environment();
     sources.file = Some(package.config());
@@ -117,5 +123,5 @@ fn services() {
 
 #[test]
 fn waiting() {
-    run("test_waiting");
+    run("test_waiting", &[]);
 }

@@ -5,6 +5,8 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::{can_run, is_complete};
+
 /// Returns the directory with the libraries that cargo has built for this test.
 #[must_use]
 pub fn libraries() -> PathBuf {
@@ -47,15 +49,39 @@ pub fn compile(compiler: &str, source: &Path, made: &Path, flags: &[&str], link:
     );
 }
 
-/// Returns the command of a Python that can load the module, which is for CPython 3.11 and later versions.
+/// Returns the command of a Python that can load the module, which is for CPython 3.11 and later versions. The
+/// environment variable `FIPA_PYTHON` selects another one.
 #[must_use]
-pub fn python() -> &'static str {
+pub fn python() -> String {
+    if let Ok(chosen) = std::env::var("FIPA_PYTHON") {
+        return chosen;
+    }
     let recent = "import sys; sys.exit(sys.version_info < (3, 11))";
     let version = Command::new("python3").args(["-c", recent]).status();
     match version.is_ok_and(|version| version.success()) {
-        true => "python3",
-        false => "python3.11",
+        true => "python3".to_owned(),
+        false => "python3.11".to_owned(),
     }
+}
+
+/// Whether the test `name` can run: there is a Python, with these modules. If not, prints a note, or panics if
+/// `CI=true`.
+///
+/// # Panics
+/// If the test cannot run and `CI=true`.
+#[must_use]
+pub fn can_import(name: &str, modules: &[&str]) -> bool {
+    let python = python();
+    if !can_run(name, &[&python], true) {
+        return false;
+    }
+    let find = "import sys, importlib.util as it; sys.exit(it.find_spec(sys.argv[1]) is None)";
+    let is_missing = |module: &&str| {
+        let found = Command::new(&python).args(["-c", find, module]).status();
+        !found.is_ok_and(|found| found.success())
+    };
+    let missing: Vec<&str> = modules.iter().copied().filter(is_missing).collect();
+    is_complete(name, &missing)
 }
 
 /// Puts the package `fipa` for Python into a directory, with the module that cargo has built.

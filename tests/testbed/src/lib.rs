@@ -98,6 +98,11 @@ pub fn can_run(name: &str, tools: &[&str], is_permitted: bool) -> bool {
     let missing = tools.iter().copied().filter(|tool| find(tool).is_none());
     let root = (!is_permitted).then_some("root");
     let missing: Vec<&str> = missing.chain(root).collect();
+    is_complete(name, &missing)
+}
+
+/// Whether nothing is missing for a test. If something is, prints a note, or panics if `CI=true`.
+fn is_complete(name: &str, missing: &[&str]) -> bool {
     if missing.is_empty() {
         return true;
     }
