@@ -1,12 +1,13 @@
 """An end of a path in Python; `fipa bench languages` starts two for each mechanism.
 
-`ends.py MECHANISM END DOMAIN PLACE LARGEST [ADDRESS]`: orders come on standard input and events go to standard output, as those
-of `part/orders.rs`. A function per mechanism returns the address of its end and the step of that end. The step of a
-sender copies a content into the memory of the mechanism and returns the answer. The step of a receiver answers one
+`ends.py MECHANISM END DOMAIN PLACE LARGEST [ADDRESS]`: orders come on standard input and events go to standard output,
+as those of `part/orders.rs`. A function per mechanism returns the address of its end and the step of that end. The step
+of a sender copies a content into the memory of the mechanism and returns the answer. The step of a receiver answers one
 message with the first and the last byte of its content. `ends.py versions` prints what this Python can import.
 """
 
 import asyncio
+import contextlib
 import functools
 import importlib.metadata
 import json
@@ -50,7 +51,7 @@ def python(end, domain, place, largest, to):
                 view[:] = content
             loan.send().wait()
         with agent.receive().wait() as letter:
-            return bytes(letter.content)
+            return bytes(letter)
 
     def receive():
         with agent.receive().wait() as letter:
@@ -72,7 +73,7 @@ def python_asyncio(end, domain, place, largest, to):
                 view[:] = content
             await loan.send()
         async with agent.receive() as letter:
-            return bytes(letter.content)
+            return bytes(letter)
 
     async def receive():
         async with agent.receive() as letter:
@@ -145,9 +146,7 @@ def zenoh(end, domain, place, largest, to):
         priority=zenoh.Priority.REAL_TIME,
         express=True,
     )
-    providers = []
-    if is_sender:
-        providers.append(zenoh.shm.ShmProvider.default_backend(4 * largest + (1 << 20)))
+    provider = zenoh.shm.ShmProvider.default_backend(4 * largest + (1 << 20))
     policy = zenoh.shm.BlockOn(zenoh.shm.GarbageCollect())
     while is_sender and not outgoing.matching_status.matching:
         time.sleep(0.01)
@@ -156,7 +155,7 @@ def zenoh(end, domain, place, largest, to):
         if len(content) < LARGE:
             outgoing.put(bytes(content))
         else:
-            memory = providers[0].alloc(len(content), policy=policy)
+            memory = provider.alloc(len(content), policy=policy)
             memory[:] = content
             outgoing.put(memory)
         return bytes(incoming.recv().payload)
@@ -165,9 +164,17 @@ def zenoh(end, domain, place, largest, to):
         # The package gives access to a content only by a copy.
         outgoing.put(probe(bytes(incoming.recv().payload)))
 
-    # Only zenoh removes its files.
-    endings.extend((session.close, providers.clear))
+    endings.extend((remove_zenoh_files, session.close))
     return address, send if is_sender else receive
+
+
+def remove_zenoh_files():
+    """Removes the files of this process in shared memory. zenoh leaves some to the next process that starts."""
+    with open("/proc/self/maps") as maps:
+        files = {line.split()[-1] for line in maps if line.endswith(".zenoh\n")}
+    for file in files:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(file)
 
 
 def iceoryx2(end, domain, place, largest, to):
@@ -226,7 +233,7 @@ def rclpy(end, domain, place, largest, to):
     topics = [f"{name}_ask", f"{name}_answer"]
     out, back = topics if end == "sender" else reversed(topics)
     taken = []
-    node.create_subscription(UInt8MultiArray, back, taken.append, 10)
+    node.create_subscription(UInt8MultiArray, back, lambda message: taken.append(message.data), 10)
     publisher = node.create_publisher(UInt8MultiArray, out, 10)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
@@ -234,16 +241,19 @@ def rclpy(end, domain, place, largest, to):
     def take():
         while not taken:
             executor.spin_once()
-        return taken.pop().data
+        return taken.pop()
 
-    def send(content):
+    def publish(content):
         # The message is memory of the process, which rclpy converts and copies.
         publisher.publish(UInt8MultiArray(data=array.array("B", content)))
+
+    def send(content):
+        publish(content)
         return bytes(take())
 
     while end == "sender" and (publisher.get_subscription_count() == 0 or node.count_publishers(back) == 0):
         executor.spin_once(timeout_sec=0.01)
-    return "", send if end == "sender" else lambda: publisher.publish(UInt8MultiArray(data=array.array("B", probe(take()))))
+    return "", send if end == "sender" else lambda: publish(probe(take()))
 
 
 MECHANISMS = {
