@@ -35,6 +35,22 @@ pub enum BenchError {
         /// The cause.
         what: String,
     },
+    /// An interpreter of Python could not be started.
+    #[error("cannot start {}", path.display())]
+    Interpreter {
+        /// The interpreter.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// An interpreter of Python cannot import the package `fipa`.
+    #[error("{} cannot import the package fipa: {why}", python.display())]
+    Package {
+        /// The interpreter.
+        python: PathBuf,
+        /// What it printed.
+        why: String,
+    },
     /// A file could not be read.
     #[error("cannot read {}", path.display())]
     Read {

@@ -12,6 +12,7 @@
 //! * [`Peers`] measures conversations with an agent of JADE, beside those of another JADE platform.
 //! * [`Locks`] measures locks, beside the same letters sent by hand.
 //! * [`Topics`] measures publications to several subscribers, beside publish-subscribe of iceoryx2 and zenoh.
+//! * [`Languages`] measures messages that are answered between Rust and Python, beside what Python has otherwise.
 //! * [`Machine`] describes the machine that was measured.
 //!
 //! The crate has no argument parser and prints nothing; `fipa bench` is its shell.
@@ -19,6 +20,7 @@
 mod baseline;
 mod comparison;
 mod error;
+mod languages;
 mod locks;
 mod machine;
 mod many;
@@ -35,6 +37,7 @@ mod topics;
 pub use baseline::{Baseline, Changes};
 pub use comparison::{Comparison, Measurement, Program, Selection};
 pub use error::{BenchError, PartError};
+pub use languages::{Languages, LanguagesReport};
 pub use locks::{Locks, LocksReport};
 pub use machine::Machine;
 pub use measure::Effort;

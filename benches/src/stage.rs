@@ -15,8 +15,8 @@ use crate::part::{End, Event, Order, Part};
 /// Timeout of an answer, which usually takes less than a second.
 const TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Time that a process of zenoh has to end after its orders end. Only zenoh removes its files.
-const ENDING: Duration = Duration::from_millis(300);
+/// Time that processes have to end after their orders end, if one uses zenoh. Only zenoh removes its files.
+const ENDING: Duration = Duration::from_secs(2);
 
 /// Beginning of the name of a measurement's directory; the process identifier follows.
 const DIRECTORY: &str = "fipa-bench-";
@@ -32,6 +32,8 @@ pub(super) struct Stage {
     program: Program,
     /// The program of the ends that use zenoh, if zenoh is measured.
     zenoh: Option<PathBuf>,
+    /// Whether a process uses zenoh.
+    ends_in_order: bool,
     place: PathBuf,
     processes: Vec<Process>,
     /// The processors that this process may use.
@@ -59,6 +61,7 @@ impl Stage {
         made.map_err(|error| format!("cannot create {}: {error}", place.display()))?;
         Ok(Self {
             program,
+            ends_in_order: zenoh.is_some(),
             zenoh,
             place,
             processes: Vec::new(),
@@ -110,6 +113,7 @@ impl Stage {
         let described = serde_json::to_string(part).map_err(|error| error.to_string())?;
         let mut command = Command::new(&self.program.path);
         command
+            .env_remove("HOME")
             .args(&self.program.arguments)
             .args(["--part", &described])
             .args(["--set", &format!("domain={}", Self::domain(domain))])
@@ -170,6 +174,30 @@ impl Stage {
         self.spawn(command, format!("zenoh {end:?}")).await
     }
 
+    /// Writes a file into the directory of the measurement.
+    pub(super) fn write(&self, name: &str, text: &str) -> Result<PathBuf, String> {
+        let path = self.place.join(name);
+        let written = std::fs::write(&path, text);
+        written.map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+        Ok(path)
+    }
+
+    /// Starts an end that is a program of its own, which also gets the domain of the measurement and its directory.
+    pub(super) async fn start_foreign(
+        &mut self,
+        mut command: Command,
+        domain: &str,
+        arguments: &[&str],
+    ) -> Result<(ProcessIndex, String), String> {
+        self.ends_in_order = true;
+        command
+            .arg(Self::domain(domain))
+            .arg(&self.place)
+            .args(arguments);
+        let name = format!("{:?}", command.as_std());
+        self.spawn(command, name).await
+    }
+
     async fn spawn(
         &mut self,
         mut command: Command,
@@ -181,7 +209,6 @@ impl Stage {
             .env("FIPA_STATE_DIR", self.place.join("state"))
             // An empty file: no other configuration of this machine applies.
             .env("FIPA_CONFIG", "/dev/null")
-            .env_remove("HOME")
             .current_dir("/")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -276,7 +303,7 @@ impl Drop for Stage {
     fn drop(&mut self) {
         // Other processes are killed while they still wait for orders: dozens of orderly ends at once would
         // take the processors from this one, which removes all files anyway.
-        if self.zenoh.is_some() {
+        if self.ends_in_order {
             for process in &mut self.processes {
                 process.orders = None;
             }

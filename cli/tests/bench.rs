@@ -5,6 +5,7 @@
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
+use fipa_testbed::languages::{can_import, install_package, libraries, python};
 use serde_json::Value;
 
 fn bench(arguments: &[&str]) -> Command {
@@ -218,6 +219,82 @@ fn publications_for_1_4_and_16_subscribers_are_measured() {
 }
 
 #[test]
+fn answered_messages_are_measured_between_rust_and_python() {
+    if !can_import("answered messages in Python", &[]) {
+        return;
+    }
+    // A dependency on the module would make maturin pack the command for one version of Python. The tests of the
+    // workspace build it.
+    if !libraries().join("libfipa_python.so").exists() {
+        let in_ci = std::env::var("CI").as_deref() == Ok("true");
+        assert!(!in_ci, "the module for Python is missing");
+        eprintln!("SKIPPED, not a success: run `cargo build -p fipa-python` first");
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    install_package(directory.path());
+    let arguments = ["languages", "--quick", "--json", "--python", &python()];
+    let child = bench(&arguments)
+        .env("PYTHONPATH", directory.path())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let pid = child.id();
+    let output = child.wait_with_output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let rows = report["rows"].as_array().unwrap();
+    for size in [1 << 10, 1 << 20] {
+        for mechanism in [
+            "rust to rust",
+            "python to rust",
+            "python to rust, asyncio",
+            "python to python",
+            "python to python, asyncio",
+            "multiprocessing pipe",
+            "multiprocessing shared memory",
+        ] {
+            let mut rows = rows.iter();
+            let row = rows.find(|row| row["mechanism"] == mechanism && row["size"] == size);
+            let row = row.unwrap_or_else(|| panic!("{mechanism}, {size}: {report:#}"));
+            for measured in ["round_trip_us", "ratio", "cpu_us"] {
+                assert!(number(&row[measured]) > 0.0, "{row:#}");
+            }
+            let is_other = mechanism.starts_with("multiprocessing");
+            assert_eq!(is_other, row["python_ratio"].is_number(), "{row:#}");
+            let has_target = mechanism == "python to rust" || is_other && size == 1 << 20;
+            assert_eq!(has_target, row["target"].is_string(), "{row:#}");
+        }
+    }
+    assert_eq!(files(pid), Vec::<String>::new());
+    assert_eq!(processes(pid), 0);
+}
+
+#[test]
+fn a_python_without_the_package_is_refused_with_a_remedy() {
+    if !can_import("a Python without the package", &[]) {
+        return;
+    }
+    // Without the packages of the user and of the system.
+    let directory = tempfile::tempdir().unwrap();
+    let isolated = directory.path().join("python");
+    let script = format!("#!/bin/sh\nexec {} -I -S \"$@\"\n", python());
+    std::fs::write(&isolated, script).unwrap();
+    let executable = std::os::unix::fs::PermissionsExt::from_mode(0o700);
+    std::fs::set_permissions(&isolated, executable).unwrap();
+    let nowhere = directory.path().join("nowhere");
+    for (interpreter, expected) in [(&isolated, "pip install fipa"), (&nowhere, "cannot start")] {
+        let mut command = bench(&["languages", "--quick", "--python"]);
+        let output = command.arg(interpreter).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(errors.contains(expected), "{errors}");
+    }
+}
+
+#[test]
 fn locks_of_a_wrong_number_of_agents_are_refused() {
     for (arguments, expected) in [
         (["locks", "--agents", "1"], "locks of 1 agents"),
@@ -362,7 +439,7 @@ fn the_evaluation_of_the_paper_is_repeated() {
 
 #[test]
 fn invalid_options_have_exit_code_2() {
-    let cases: [(&[&str], &str); 7] = [
+    let cases: [(&[&str], &str); 9] = [
         (&["shm", "--sizes", "1GiB"], "--sizes"),
         (&["shm", "--dir", "/tmp"], "--dir"),
         (&["paper", "--svg", "/dev/null"], "--svg"),
@@ -370,6 +447,8 @@ fn invalid_options_have_exit_code_2() {
         (&["paper", "--dir", "/nowhere"], "--dir"),
         (&["topics", "--svg", "/dev/null"], "--svg"),
         (&["topics", "--baseline", "/dev/null"], "--baseline"),
+        (&["topics", "--python", "python3"], "--python"),
+        (&["languages", "--svg", "/dev/null"], "--svg"),
     ];
     for (arguments, wrong) in cases {
         let output = bench(arguments).output().unwrap();

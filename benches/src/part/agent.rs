@@ -135,6 +135,41 @@ impl<A: Send + 'static> Running<A> {
     }
 }
 
+/// Executes orders with one agent.
+pub(super) fn play<A: Steps>(
+    config: &Config,
+    name: &str,
+    make: impl FnOnce(fipa::Agent, Lines<BufReader<Stdin>>) -> Result<A, String>,
+) -> Result<(), String> {
+    let runtime = runtime()?;
+    let domain = runtime.block_on(Domain::open(config)).map_err(chain_text)?;
+    let agent = runtime.block_on(async {
+        let agent = domain.register(name).await.map_err(chain_text)?;
+        make(agent, orders())
+    })?;
+    let mut running = Running {
+        agent: Some(agent),
+        runtime,
+    };
+    execute_orders(&mut running, name.to_owned());
+    let Running { agent, runtime } = running;
+    drop(agent);
+    runtime.block_on(domain.close());
+    // The thread that reads standard input may block.
+    runtime.shutdown_background();
+    Ok(())
+}
+
+/// Waits until the directory lists the agent of this name.
+pub(super) async fn listed(agent: &fipa::Agent, name: &str) -> Result<(), String> {
+    let directory = agent.domain().directory();
+    let mut changes = directory.watch();
+    while directory.lookup(name).is_none() {
+        changes.next().await.ok_or("the directory was closed")?;
+    }
+    Ok(())
+}
+
 /// The steps of agents that execute orders in a task.
 pub(super) trait Steps: Sized + Send + 'static {
     fn orders(&mut self) -> &mut Lines<BufReader<Stdin>>;

@@ -6,6 +6,7 @@
 
 mod agent;
 mod iceoryx;
+mod languages;
 mod letters;
 mod locks;
 mod orders;
@@ -51,6 +52,8 @@ pub(super) enum Part {
     Letters { end: End },
     /// Bare iceoryx2.
     Iceoryx { end: End, wait: Wait },
+    /// An agent that sends requests, or one that answers them.
+    Correspondent { end: End },
     /// An agent that publishes a topic.
     Publisher,
     /// An agent with this index that subscribes to the topic.
@@ -74,9 +77,10 @@ impl Part {
             | Self::Iceoryx { end, .. }
             | Self::Socket { end, .. } => Some(*end),
             Self::Crowd { .. } => Some(End::Receiver),
-            // More processes than processors take part.
+            // More processes or threads than processors take part.
             Self::Locks(_)
             | Self::Watcher
+            | Self::Correspondent { .. }
             | Self::Publisher
             | Self::Subscriber { .. }
             | Self::IceoryxPublisher { .. }
@@ -187,6 +191,7 @@ fn play_part(part: Part, config: &Config) -> Result<(), String> {
         Part::Gateway => agent::gateway(config),
         Part::Letters { end } => letters::play(config, end),
         Part::Iceoryx { end, wait } => iceoryx::play(config, end, wait.into()),
+        Part::Correspondent { end } => languages::play(config, end),
         Part::Publisher => topics::publish(config),
         Part::Subscriber { index } => topics::subscribe(config, index),
         Part::IceoryxPublisher { subscribers } => iceoryx::publish(config, subscribers),

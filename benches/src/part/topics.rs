@@ -4,11 +4,11 @@ use std::time::Duration;
 
 use fipa::protocol::Keep;
 use fipa::topics::{Publisher, Topic};
-use fipa::{AgentId, Config, Domain, Performative, protocol::Subscription};
+use fipa::{AgentId, Config, Performative, protocol::Subscription};
 use tokio::io::{BufReader, Lines, Stdin};
 
-use super::agent::{Running, Steps, orders, runtime};
-use super::orders::{Letters, Sent, byte_of, check, execute_orders, now_ns};
+use super::agent::{Steps, listed, play};
+use super::orders::{Letters, Sent, byte_of, check, now_ns};
 use crate::error::chain_text;
 
 /// Name of the agent that publishes.
@@ -38,31 +38,6 @@ pub(super) fn subscribe(config: &Config, index: usize) -> Result<(), String> {
             orders,
         })
     })
-}
-
-/// Executes orders with one agent.
-fn play<A: Steps>(
-    config: &Config,
-    name: &str,
-    make: impl FnOnce(fipa::Agent, Lines<BufReader<Stdin>>) -> Result<A, String>,
-) -> Result<(), String> {
-    let runtime = runtime()?;
-    let domain = runtime.block_on(Domain::open(config)).map_err(chain_text)?;
-    let agent = runtime.block_on(async {
-        let agent = domain.register(name).await.map_err(chain_text)?;
-        make(agent, orders())
-    })?;
-    let mut running = Running {
-        agent: Some(agent),
-        runtime,
-    };
-    execute_orders(&mut running, name.to_owned());
-    let Running { agent, runtime } = running;
-    drop(agent);
-    runtime.block_on(domain.close());
-    // The thread that reads standard input may block.
-    runtime.shutdown_background();
-    Ok(())
 }
 
 struct Publishing {
@@ -107,11 +82,7 @@ impl Steps for Subscribing {
 
     /// Subscribes to the topic of this agent, as soon as the directory has it.
     async fn find(&mut self, to: &str) -> Result<(), String> {
-        let directory = self.agent.domain().directory();
-        let mut changes = directory.watch();
-        while directory.lookup(to).is_none() {
-            changes.next().await.ok_or("the directory was closed")?;
-        }
+        listed(&self.agent, to).await?;
         let publisher = AgentId::new(to).map_err(chain_text)?;
         let subscribe = self.agent.message(Performative::Subscribe);
         let subscribe = subscribe.receiver(publisher).content(TOPIC);

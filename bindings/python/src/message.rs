@@ -5,6 +5,7 @@ use std::time::SystemTime;
 use fipa::{Agent, MessageBuilder, Performative, Time};
 use fipa_bindings::{Failure, OrFail as _};
 use pyo3::buffer::PyBuffer;
+use pyo3::intern;
 use pyo3::types::{
     PyAnyMethods, PyBytes, PyBytesMethods, PyListMethods, PyMapping, PyMappingMethods,
     PyMemoryView, PyString, PyStringMethods,
@@ -78,7 +79,7 @@ impl<'py> Draft<'py> {
         default: Option<Performative>,
     ) -> PyResult<Self> {
         let py = message.py();
-        let act: String = message.getattr("performative")?.extract()?;
+        let act: String = message.getattr(intern!(py, "performative"))?.extract()?;
         let act = match (act.is_empty(), default) {
             (true, Some(default)) => default,
             (true, None) => {
@@ -88,13 +89,14 @@ impl<'py> Draft<'py> {
         };
         Ok(Self {
             act,
-            receivers: names(&message.getattr("receivers")?)?,
+            receivers: names(&message.getattr(intern!(py, "receivers"))?)?,
             message: message.clone(),
         })
     }
 
     pub(crate) fn content(&self) -> PyResult<Option<Content<'py>>> {
-        let content = self.message.getattr("content")?;
+        let py = self.message.py();
+        let content = self.message.getattr(intern!(py, "content"))?;
         (!content.is_none())
             .then(|| Content::read(&content))
             .transpose()
@@ -130,7 +132,8 @@ impl<'py> Draft<'py> {
 
     /// Adds a copy of the content.
     pub(crate) fn with_content(&self, builder: MessageBuilder) -> PyResult<MessageBuilder> {
-        let content = self.message.getattr("content")?;
+        let py = self.message.py();
+        let content = self.message.getattr(intern!(py, "content"))?;
         match content.is_none() {
             true => Ok(builder),
             false => Ok(builder.content(Content::copied(&content)?)),
@@ -140,18 +143,21 @@ impl<'py> Draft<'py> {
     /// Adds all parameters but the act, the sender, the receivers and the content.
     fn complete(&self, mut builder: MessageBuilder) -> PyResult<MessageBuilder> {
         let py = self.message.py();
-        for agent in names(&self.message.getattr("reply_to")?)? {
+        for agent in names(&self.message.getattr(intern!(py, "reply_to"))?)? {
             builder = builder.reply_to(agent.as_str());
         }
         type Set = fn(MessageBuilder, String) -> MessageBuilder;
-        let parameters: [(&str, Set); 7] = [
-            ("language", MessageBuilder::language),
-            ("encoding", MessageBuilder::encoding),
-            ("ontology", MessageBuilder::ontology),
-            ("protocol", MessageBuilder::protocol),
-            ("conversation_id", MessageBuilder::conversation_id),
-            ("reply_with", MessageBuilder::reply_with),
-            ("in_reply_to", MessageBuilder::in_reply_to),
+        let parameters: [(&Bound<'_, PyString>, Set); 7] = [
+            (intern!(py, "language"), MessageBuilder::language),
+            (intern!(py, "encoding"), MessageBuilder::encoding),
+            (intern!(py, "ontology"), MessageBuilder::ontology),
+            (intern!(py, "protocol"), MessageBuilder::protocol),
+            (
+                intern!(py, "conversation_id"),
+                MessageBuilder::conversation_id,
+            ),
+            (intern!(py, "reply_with"), MessageBuilder::reply_with),
+            (intern!(py, "in_reply_to"), MessageBuilder::in_reply_to),
         ];
         for (name, set) in parameters {
             let value: Option<String> = self.message.getattr(name)?.extract()?;
@@ -159,16 +165,16 @@ impl<'py> Draft<'py> {
                 builder = set(builder, value);
             }
         }
-        let by: Option<SystemTime> = self.message.getattr("reply_by")?.extract()?;
+        let by: Option<SystemTime> = self.message.getattr(intern!(py, "reply_by"))?.extract()?;
         if let Some(by) = by {
             builder = builder.reply_by(Time::from_system_time(by).or_fail().or_raise(py)?);
         }
-        let parameters = self.message.getattr("parameters")?;
+        let parameters = self.message.getattr(intern!(py, "parameters"))?;
         for parameter in parameters.cast::<PyMapping>()?.items()?.iter() {
             let (name, value): (String, String) = parameter.extract()?;
             builder = builder.user_defined(&name, &value);
         }
-        let lock = self.message.getattr("lock")?;
+        let lock = self.message.getattr(intern!(py, "lock"))?;
         guarded(&lock, builder)
     }
 }

@@ -85,6 +85,14 @@ fn run_in(package: &Package, tests: &str) {
 }
 
 #[test]
+fn the_package_requires_the_command_of_its_version() {
+    let project = Path::new(env!("CARGO_MANIFEST_DIR")).join("pyproject.toml");
+    let text = fs::read_to_string(project).expect("the file is there");
+    let required = format!("\"fipa-cli == {}\"", env!("CARGO_PKG_VERSION"));
+    assert!(text.contains(&required), "{required} is not in {text}");
+}
+
+#[test]
 fn examples() {
     run("test_examples", &[]);
 }

@@ -9,8 +9,8 @@ use clap::{Args, ValueEnum};
 use fipa::error::ErrorChain;
 use fipa::{AgentId, Config, Incarnation, RegisterOptions};
 use fipa_bench::{
-    Baseline, BenchError, Changes, Comparison, Effort, Locks, LocksReport, Machine, Measurement,
-    Paper, Peers, Program, Selection, Topics, TopicsReport,
+    Baseline, BenchError, Changes, Comparison, Effort, Languages, LanguagesReport, Locks,
+    LocksReport, Machine, Measurement, Paper, Peers, Program, Selection, Topics, TopicsReport,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -35,6 +35,9 @@ use crate::{membership, output};
 /// publish-subscribe, and beside the shared memory of zenoh with --zenoh. All processes sleep between two
 /// publications.
 ///
+/// `languages` measures messages that are answered, between two processes in Rust, in Python and in both, beside
+/// the pipes and the shared memory of multiprocessing, zenoh, iceoryx2 and rclpy, if --python can import them.
+///
 /// On a busy machine the times are unreliable; the ratios are less affected.
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -50,6 +53,8 @@ Examples:
   fipa bench locks --agents 2,16 --json | jq '.rows[] | {algorithm, agents, hosts, letters, ratio}'
   fipa bench topics --zenoh benches/comparison/zenoh/target/release/fipa-comparison-zenoh
   fipa bench topics --json | jq '.rows[] | {subscribers, fipa_us, ratio}'
+  fipa bench languages --python venv/bin/python
+  fipa bench languages --sizes 1KiB --json | jq '.rows[] | {mechanism, round_trip_us, ratio}'
   fipa bench peers --jade http://127.0.0.1:7777/acc --jade-asker http://127.0.0.1:7776/acc")]
 pub(crate) struct Arguments {
     /// Part to measure [default: shm and net]
@@ -70,13 +75,13 @@ pub(crate) struct Arguments {
     /// Take fewer samples: a few seconds, with a larger spread
     #[arg(long)]
     quick: bool,
-    /// Content sizes; not used by `paper`, `locks` and `topics`
+    /// Content sizes; not used by `paper`, `locks` and `topics` [default: 100B,1KiB,64KiB,1MiB,4MiB; for
+    /// `languages` 1KiB,1MiB]
     #[arg(
         long,
         value_delimiter = ',',
         value_name = "SIZE",
         value_parser = options::size,
-        default_value = "100B,1KiB,64KiB,1MiB,4MiB"
     )]
     sizes: Vec<u64>,
     /// Numbers of agents that share a resource, for `locks` [default: 2,8,32; with --quick 2,8]
@@ -88,6 +93,9 @@ pub(crate) struct Arguments {
     /// Also measure zenoh in the same rounds, with this program (see benches/comparison/zenoh)
     #[arg(long, value_name = "PROGRAM")]
     zenoh: Option<PathBuf>,
+    /// Interpreter of Python that has the package `fipa`, for `languages` [default: python3]
+    #[arg(long, value_name = "PROGRAM")]
+    python: Option<PathBuf>,
     /// Address of the JADE platform that runs the agent of --echo, for `peers`
     ///
     /// `peers` measures conversations of 100 bytes in a row with that agent, through the gateway of this
@@ -114,6 +122,9 @@ pub(crate) struct Arguments {
     core: Option<usize>,
 }
 
+/// Content sizes of `shm` and `net` if none are given.
+const SIZES: [u64; 5] = [100, 1 << 10, 64 << 10, 1 << 20, 4 << 20];
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum What {
     /// Shared memory between two agents on one host
@@ -128,6 +139,8 @@ enum What {
     Locks,
     /// Publications of 1 MB for up to 16 subscribers, beside raw iceoryx2 and zenoh
     Topics,
+    /// Answered messages between Rust and Python, beside multiprocessing, zenoh, iceoryx2 and rclpy
+    Languages,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -147,8 +160,16 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 "omit --agents, or measure `locks`",
             ));
         }
+        (what, _) if what != Some(What::Languages) && arguments.python.is_some() => {
+            return Err(Failure::wrong_usage(
+                "--python is only for `fipa bench languages`",
+                "--python",
+                "omit --python, or measure `languages`",
+            ));
+        }
         (Some(What::Paper), _) => return measure_paper(&arguments),
         (Some(What::Topics), None) => return measure_topics(&arguments),
+        (Some(What::Languages), None) => return measure_languages(&arguments),
         (Some(What::Peers), Some(jade)) => return measure_peers(&arguments, jade, &config),
         (Some(What::Peers), None) => {
             return Err(Failure::wrong_usage(
@@ -181,7 +202,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     }
     let mut comparison = Comparison::new(
         config.mts.transports.clone(),
-        effort(&arguments)?,
+        effort(&arguments, &SIZES)?,
         this_program()?,
     );
     comparison.selection = match arguments.what {
@@ -300,13 +321,7 @@ fn measure_topics(arguments: &Arguments) -> Result<(), Failure> {
         ("--baseline", arguments.baseline.is_some()),
         ("--dir", arguments.dir.is_some()),
     ];
-    if let Some((option, _)) = options.into_iter().find(|(_, is_given)| *is_given) {
-        return Err(Failure::wrong_usage(
-            format!("`fipa bench topics` has no {option}"),
-            option,
-            format!("omit {option} or `topics`"),
-        ));
-    }
+    refuse("topics", options)?;
     let mut topics = match arguments.quick {
         true => Topics::quick(this_program()?),
         false => Topics::full(this_program()?),
@@ -325,6 +340,59 @@ fn measure_topics(arguments: &Arguments) -> Result<(), Failure> {
     match arguments.json {
         true => output::json(&measured.to_json()),
         false => output::text(&measured.to_text()),
+    }
+}
+
+/// Measures messages that are answered between Rust and Python.
+fn measure_languages(arguments: &Arguments) -> Result<(), Failure> {
+    let options = [
+        ("--svg", arguments.svg.is_some()),
+        ("--baseline", arguments.baseline.is_some()),
+        ("--dir", arguments.dir.is_some()),
+        ("--zenoh", arguments.zenoh.is_some()),
+    ];
+    refuse("languages", options)?;
+    let effort = effort(arguments, &[1 << 10, 1 << 20])?;
+    let mut languages = Languages::new(this_program()?, effort);
+    if let Some(python) = &arguments.python {
+        languages.python = interpreter(python);
+    }
+    let measured: LanguagesReport = membership::run(async {
+        let machine = observe().await;
+        let progress = Progress::new(languages.steps());
+        let measured = languages.run(machine, |step| progress.begin(step)).await;
+        progress.end();
+        measured.map_err(failed)
+    })?;
+    for note in measured.notes() {
+        fipa::log_limit::info!("{note}");
+    }
+    match arguments.json {
+        true => output::json(&measured.to_json()),
+        false => output::text(&measured.to_text()),
+    }
+}
+
+/// The absolute path of an interpreter, whose processes run in another directory, or its name if it has no path. The
+/// interpreter of a virtual environment is a link, which is not followed.
+fn interpreter(given: &Path) -> PathBuf {
+    match given.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => {
+            std::path::absolute(given).unwrap_or_else(|_| given.to_owned())
+        }
+        _ => given.to_owned(),
+    }
+}
+
+/// Refuses the first option that is given, which a part does not have.
+fn refuse<const N: usize>(part: &str, options: [(&str, bool); N]) -> Result<(), Failure> {
+    match options.into_iter().find(|(_, is_given)| *is_given) {
+        None => Ok(()),
+        Some((option, _)) => Err(Failure::wrong_usage(
+            format!("`fipa bench {part}` has no {option}"),
+            option,
+            format!("omit {option} or `{part}`"),
+        )),
     }
 }
 
@@ -439,6 +507,7 @@ fn failed(error: BenchError) -> Failure {
         BenchError::Write { path, .. }
         | BenchError::Read { path, .. }
         | BenchError::Baseline { path, .. } => path.display().to_string(),
+        BenchError::Interpreter { .. } | BenchError::Package { .. } => "--python".to_owned(),
         _ => "fipa bench".to_owned(),
     };
     let advice = match &error {
@@ -449,6 +518,8 @@ fn failed(error: BenchError) -> Failure {
         BenchError::Peer { .. } => {
             "check that JADE runs with the agents of benches/comparison/jade, and the gateway with http"
         }
+        BenchError::Interpreter { .. } => "give the interpreter with --python PROGRAM",
+        BenchError::Package { .. } => "install the package for that interpreter: pip install fipa",
         BenchError::Read { .. } => "check the name of the file",
         BenchError::Baseline { .. } => "make a baseline with `fipa bench --json > FILE`",
         BenchError::Write { .. } => "check that this user can write there",
@@ -457,8 +528,13 @@ fn failed(error: BenchError) -> Failure {
     Failure::failed(ErrorChain(&error).to_string(), place, advice)
 }
 
-fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
-    let sizes = arguments.sizes.iter().copied();
+/// The extent with the given sizes or, if none are given, with these.
+fn effort(arguments: &Arguments, otherwise: &[u64]) -> Result<Effort, Failure> {
+    let sizes = match arguments.sizes.as_slice() {
+        [] => otherwise,
+        given => given,
+    };
+    let sizes = sizes.iter().copied();
     let effort = if arguments.quick {
         Effort::quick(sizes)
     } else {
