@@ -805,7 +805,7 @@ fipa_result fipa_begin_call(fipa_handle agent,
 
 /*
  Returns a proposal, with an index from 0, as a letter that the caller closes. `fipa_read_text` of the call returns
- the other answers in JSON: `refusals`, `silent`, `unreached`, `gone` and `violations`.
+ the other answers in JSON: `refusals` (each with `agent` and `reason`), `silent`, `unreached`, `gone` and `violations`.
 
  # Safety
  `letter` is NULL or can be written.

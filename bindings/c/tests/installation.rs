@@ -32,6 +32,7 @@ fn install(build: &Path, prefix: &Path) {
             .arg(build)
             .arg(define("CMAKE_INSTALL_PREFIX", prefix))
             .arg("-DCMAKE_INSTALL_LIBDIR=lib")
+            .args(cfg!(feature = "gateway").then_some("-DFIPA_GATEWAY=ON"))
             .arg(define("FIPA_LIBRARY_DIR", &libraries())),
     );
     tool(Command::new("cmake").arg("--install").arg(build));
@@ -85,6 +86,7 @@ fn with_pkg_config(workshop: &Workshop, libraries: &Path) {
             .args(["--cflags", "--libs", "fipa"])
             .env("PKG_CONFIG_PATH", libraries.join("pkgconfig")),
     );
+    assert_eq!(flags.contains("FIPA_GATEWAY"), cfg!(feature = "gateway"));
     let program = workshop.path().join("with_pkg_config");
     // No other path to the headers and the library than that of pkg-config.
     tool(

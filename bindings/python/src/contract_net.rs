@@ -81,7 +81,8 @@ impl Bids {
             .collect()
     }
 
-    /// The other answers, a dictionary: `refusals`, `silent`, `unreached`, `gone` and `violations`.
+    /// The other answers, a dictionary: `refusals` (each with `agent` and `reason`), `silent`, `unreached`, `gone` and
+    /// `violations`.
     #[getter]
     fn answers(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         to_python(py, &self.answers)

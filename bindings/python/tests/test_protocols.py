@@ -110,10 +110,19 @@ class Conversations(Loops):
                 done.append(name)
                 return f"done by {name}"
 
-        call = fipa.Message(receivers=[self.arm.name, other.name], content="(lift crate)")
+        busy = await self.domain.register(f"{other.name}_busy")
+
+        @busy.serve("fipa-contract-net")
+        async def refuse(task: fipa.Task) -> None:
+            raise fipa.Refuse("busy")
+
+        call = fipa.Message(receivers=[self.arm.name, other.name, busy.name], content="(lift crate)")
         bids = await self.rover.call_for_proposals(call, timeout=30)
         self.assertEqual(len(bids.proposals), 2)
         self.assertEqual(bids.answers["silent"], [])
+        (refusal,) = bids.answers["refusals"]
+        self.assertEqual(refusal["agent"], busy.name)
+        self.assertIn("busy", refusal["reason"])
         best = min(bids.proposals, key=lambda letter: int(letter.text))
         results = await bids.award(best)
         self.assertEqual({name: result.text for name, result in results.items()}, {other.name: f"done by {other.name}"})

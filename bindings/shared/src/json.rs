@@ -1,8 +1,8 @@
 //! What the interfaces report in JSON.
 
-use fipa::Change;
 use fipa::coalitions::CoalitionState;
 use fipa::protocol::Bids;
+use fipa::{AgentId, Change, Message};
 use serde_json::{Value, json};
 
 /// Lists the changes of a directory that took effect at once one by one: objects with `change` (`joined`, `changed`,
@@ -30,9 +30,10 @@ pub fn coalition(state: &CoalitionState) -> Value {
 }
 
 /// Reports the answers to a call for proposals: the number of `proposals`, and the agents that have answered otherwise.
+/// The `refusals` are objects with `agent` and `reason`.
 #[must_use]
 pub fn bids(bids: &Bids) -> Value {
-    let refusals: Vec<String> = bids.refusals.iter().map(ToString::to_string).collect();
+    let refusals: Vec<Value> = bids.refusals.iter().map(refusal).collect();
     let violations: Vec<String> = bids.violations.iter().map(ToString::to_string).collect();
     json!({
         "proposals": bids.proposals.len(),
@@ -41,5 +42,12 @@ pub fn bids(bids: &Bids) -> Value {
         "unreached": bids.unreached,
         "gone": bids.gone,
         "violations": violations,
+    })
+}
+
+fn refusal(message: &Message) -> Value {
+    json!({
+        "agent": message.sender().map(AgentId::name),
+        "reason": String::from_utf8_lossy(message.content().map_or(&[][..], |content| content)),
     })
 }

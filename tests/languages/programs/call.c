@@ -48,7 +48,7 @@ static int refusals(fipa_handle bids) {
   int count = 0;
   must(fipa_read_text(bids, &others));
   copy(all, sizeof all, others.data, others.len);
-  for (const char *at = all; (at = strstr(at, "(refuse ")) != NULL; at++) count++;
+  for (const char *at = all; (at = strstr(at, "\"reason\":")) != NULL; at++) count++;
   return count;
 }
 

@@ -40,7 +40,7 @@ static std::vector<proposal> sorted(const fipa::bids& bids, std::size_t count) {
 /* Returns the number of refusals among the other answers, which are in JSON. */
 static int refusals(std::string_view others) {
   int count = 0;
-  for (auto at = others.find("(refuse "); at != others.npos; at = others.find("(refuse ", at + 1)) count++;
+  for (auto at = others.find("\"reason\":"); at != others.npos; at = others.find("\"reason\":", at + 1)) count++;
   return count;
 }
 
