@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use fipa::blocking::Wait;
 use fipa::error::DeregisterError;
-use fipa::{Agent, Deliveries, Incoming, Loan, MessageBuilder, RegisterOptions};
+use fipa::{Agent, Incoming, Loan, MessageBuilder, RegisterOptions};
 use futures_util::stream::unfold;
 
 use crate::domain::Membership;
@@ -15,7 +15,7 @@ use crate::loaned::Loaned;
 use crate::message::Draft;
 use crate::raw::{Extensible, FipaText, Place, Readable, limit, structure};
 use crate::table::{self, FipaHandle, Object};
-use fipa_bindings::{Failure, FailureKind, OrFail, Sending, send_loan};
+use fipa_bindings::{Failure, OrFail, Sending, all_delivered, send_loan};
 
 /// The description of an agent in the directory. A field that is zero is not set.
 #[repr(C)]
@@ -111,17 +111,6 @@ fn settle(sending: Sending, outcomes: Option<Place<FipaHandle>>) -> Result<FipaR
         table::give(outcomes, Text::json(&deliveries)?);
     }
     all_delivered(&deliveries).map(|()| FipaResult::Ok)
-}
-
-/// A failure that lists the outcomes, unless each receiver has got the letter.
-fn all_delivered(outcomes: &Deliveries) -> Result<(), Failure> {
-    match outcomes.all_succeeded() {
-        true => Ok(()),
-        false => Err(Failure::new(
-            FailureKind::NotDelivered,
-            outcomes.to_string(),
-        )),
-    }
 }
 
 /// An operation that ends with the outcomes.

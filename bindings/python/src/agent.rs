@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use fipa::error::DeregisterError;
 use fipa::{Agent as Registered, Deliveries as Outcomes, Loan as OpenLoan};
-use fipa_bindings::{Failure, FailureKind, OrFail as _, Sending, send, send_loan};
+use fipa_bindings::{Failure, FailureKind, OrFail as _, Sending, all_delivered, send, send_loan};
 use pyo3::types::PyTuple;
 use pyo3::{Bound, Py, PyAny, PyErr, PyResult, Python, ffi, pyclass, pymethods};
 use serde_json::Value;
@@ -164,12 +164,7 @@ impl Agent {
 fn outcomes(sending: Sending) -> Pending {
     Pending::begun(async {
         let outcomes = sending.await.or_fail()?;
-        if !outcomes.all_succeeded() {
-            return Err(Failure::new(
-                FailureKind::NotDelivered,
-                outcomes.to_string(),
-            ));
-        }
+        all_delivered(&outcomes)?;
         Ok(Box::new(|py: Python<'_>| Ok(Py::new(py, Deliveries(outcomes))?.into_any())) as _)
     })
 }

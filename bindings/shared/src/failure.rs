@@ -3,6 +3,7 @@
 use std::error::Error as _;
 use std::fmt;
 
+use fipa::FailureReason;
 use fipa::actions::ActionError;
 use fipa::error::{OpenError, ReceiveError, RegisterError, SendError};
 use fipa::locks::LockError;
@@ -141,6 +142,10 @@ fn dialogue(error: &DialogueError) -> FailureKind {
             FailureKind::Refused
         }
         DialogueError::Cancelled(_) => FailureKind::Cancelled,
+        DialogueError::NotDelivered {
+            reason: FailureReason::Closed,
+            ..
+        } => FailureKind::Closed,
         DialogueError::NotDelivered { .. } | DialogueError::Undelivered(_) => {
             FailureKind::NotDelivered
         }

@@ -16,5 +16,5 @@ pub use crate::json::{bids, coalition, flattened};
 pub use crate::queue::bell::Bell;
 pub use crate::queue::{Item, Operation, Queue};
 pub use crate::script::{Emitter, script};
-pub use crate::sending::{Sending, send, send_loan};
+pub use crate::sending::{Sending, all_delivered, send, send_loan};
 pub use crate::services::{service_from_json, services_to_json, template_from_json};

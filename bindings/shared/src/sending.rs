@@ -4,9 +4,9 @@ use std::pin::Pin;
 use std::time::Duration;
 
 use fipa::error::SendError;
-use fipa::{Agent, Deliveries, Loan, MessageBuilder};
+use fipa::{Agent, Deliveries, FailureReason, Loan, MessageBuilder, Outcome};
 
-use crate::failure::{Failure, OrFail as _};
+use crate::failure::{Failure, FailureKind, OrFail as _};
 
 /// Length of a content in bytes from which it is copied into memory that the receivers read in place.
 const IN_PLACE: usize = 4_096;
@@ -51,4 +51,25 @@ pub fn send_loan(agent: &Agent, loan: Loan, within: Option<Duration>) -> Sending
         Some(within) => Box::pin(agent.send_loan_within(loan, within)),
         None => Box::pin(agent.send_loan(loan)),
     }
+}
+
+/// Checks that each receiver has got the letter.
+///
+/// # Errors
+/// Lists the outcomes if one has not.
+pub fn all_delivered(outcomes: &Deliveries) -> Result<(), Failure> {
+    if outcomes.all_succeeded() {
+        return Ok(());
+    }
+    let is_closed = |outcome: &Outcome| {
+        let Outcome::Failed { reason, .. } = outcome else {
+            return false;
+        };
+        *reason == FailureReason::Closed
+    };
+    let kind = match outcomes.0.iter().any(|it| is_closed(&it.outcome)) {
+        true => FailureKind::Closed,
+        false => FailureKind::NotDelivered,
+    };
+    Err(Failure::new(kind, outcomes.to_string()))
 }

@@ -581,6 +581,8 @@ static void gateway(const char *config) {
 #endif
 
 int main(int argc, char **argv) {
+  const fipa_text to = text("rover");
+  const fipa_message last = message("inform", &to, "");
   fipa_handle listening, letter;
   fipa_result result;
   CHECK(argc == 3);
@@ -616,6 +618,7 @@ int main(int argc, char **argv) {
     result = fipa_receive(rover, 0, &letter);
   } while (result == FIPA_RESULT_OK && fipa_close(letter) == FIPA_RESULT_OK);
   CHECK(result == FIPA_RESULT_CLOSED);
+  CHECK(fipa_send(rover, &last, -1, NULL) == FIPA_RESULT_CLOSED);
   OK(fipa_close(rover));
   puts("all steps passed");
   return 0;
