@@ -72,7 +72,7 @@ async fn the_operator_may_be_a_program_in_python() {
     install_package(package.path());
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let packages = format!("PYTHONPATH={}", package.path().display());
-    let operator = here.join("operator.py");
+    let operator = here.join("stack_operator.py");
     let operator = [
         "env".into(),
         packages.into(),

@@ -34,7 +34,7 @@ use crate::report::Failure;
 #[command(
     after_help = "Examples:\n  fipa demo dock\n  fipa demo dock --fault master-stopped --svg dock.svg\n  \
                   fipa demo dock --fault random --seed 7\n  \
-                  fipa demo dock --operator examples/reconfiguration/operator.py\n  \
+                  fipa demo dock --operator examples/reconfiguration/stack_operator.py\n  \
                   fipa demo dock --json | jq '.reports[] | select(.claim == \"noticed\")'\n\nJSON:\n  \
                   { \"fault\", \"seed\", \"passed\": [checks], \"failed\": [checks with reasons],\n    \
                   \"reports\": [ { \"at\" in microseconds since 1970, \"by\", \"claim\", its details } ] }"
