@@ -48,7 +48,7 @@ pub enum BenchError {
     Package {
         /// The interpreter.
         python: PathBuf,
-        /// What it printed.
+        /// The reason that it gives.
         why: String,
     },
     /// A file could not be read.

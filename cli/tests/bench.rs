@@ -50,7 +50,11 @@ fn number(value: &Value) -> f64 {
 
 /// Runs a quick measurement. Returns its process and its report.
 fn measured(arguments: &[&str]) -> (u32, Value) {
-    let child = bench(arguments)
+    measured_by(&mut bench(arguments))
+}
+
+fn measured_by(command: &mut Command) -> (u32, Value) {
+    let child = command
         .args(["--quick", "--json"])
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -233,18 +237,8 @@ fn answered_messages_are_measured_between_rust_and_python() {
     }
     let directory = tempfile::tempdir().unwrap();
     install_package(directory.path());
-    let arguments = ["languages", "--quick", "--json", "--python", &python()];
-    let child = bench(&arguments)
-        .env("PYTHONPATH", directory.path())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let pid = child.id();
-    let output = child.wait_with_output().unwrap();
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{errors}");
-    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let mut command = bench(&["languages", "--python", &python()]);
+    let (pid, report) = measured_by(command.env("PYTHONPATH", directory.path()));
     let rows = report["rows"].as_array().unwrap();
     for size in [1 << 10, 1 << 20] {
         for mechanism in [

@@ -104,7 +104,7 @@ pub struct LanguagesReport {
     notes: Vec<String>,
 }
 
-/// What an interpreter of Python can import.
+/// The version of an interpreter of Python, and the packages that it can import.
 #[derive(Debug, Deserialize)]
 struct Versions {
     python: String,

@@ -61,13 +61,8 @@ pub fn all_delivered(outcomes: &Deliveries) -> Result<(), Failure> {
     if outcomes.all_succeeded() {
         return Ok(());
     }
-    let is_closed = |outcome: &Outcome| {
-        let Outcome::Failed { reason, .. } = outcome else {
-            return false;
-        };
-        *reason == FailureReason::Closed
-    };
-    let kind = match outcomes.0.iter().any(|it| is_closed(&it.outcome)) {
+    let closed = |outcome: &Outcome| matches!(outcome, Outcome::Failed { reason, .. } if *reason == FailureReason::Closed);
+    let kind = match outcomes.0.iter().any(|it| closed(&it.outcome)) {
         true => FailureKind::Closed,
         false => FailureKind::NotDelivered,
     };

@@ -334,12 +334,17 @@ fn measure_topics(arguments: &Arguments) -> Result<(), Failure> {
         progress.end();
         measured.map_err(failed)
     })?;
-    for note in measured.notes() {
-        fipa::log_limit::info!("{note}");
-    }
+    show_notes(measured.notes());
     match arguments.json {
         true => output::json(&measured.to_json()),
         false => output::text(&measured.to_text()),
+    }
+}
+
+/// Logs what was not measured.
+fn show_notes(notes: &[String]) {
+    for note in notes {
+        fipa::log_limit::info!("{note}");
     }
 }
 
@@ -364,9 +369,7 @@ fn measure_languages(arguments: &Arguments) -> Result<(), Failure> {
         progress.end();
         measured.map_err(failed)
     })?;
-    for note in measured.notes() {
-        fipa::log_limit::info!("{note}");
-    }
+    show_notes(measured.notes());
     match arguments.json {
         true => output::json(&measured.to_json()),
         false => output::text(&measured.to_text()),
