@@ -1,0 +1,1 @@
+"""The bridge between ROS 2 and agents: the command `fipa-ros2`."""

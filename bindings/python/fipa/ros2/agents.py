@@ -1,0 +1,197 @@
+"""Agents for ROS: their actions, services and topics become an action server, a service and a publisher."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from typing import Any
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.qos import QoSProfile
+
+import fipa
+from fipa import sl
+from fipa.ros2 import types, values
+from fipa.ros2.ros import Full, Ros
+
+_log = logging.getLogger("fipa.ros2")
+
+#: Longest time between two attempts to subscribe to a topic of an agent, in seconds.
+LONGEST_PAUSE = 30.0
+
+#: Depth of the queue of a publisher.
+DEPTH = 10
+
+
+class AgentAction:
+    """An action of an agent, as an action server of ROS."""
+
+    def __init__(self, ros: Ros, own: fipa.Agent, agent: str, word: str, kind: Any) -> None:
+        self._ros = ros
+        self._own = own
+        self._agent = agent
+        self._word = word
+        self._kind = kind
+        #: The goals that the agent has accepted, by the identity of the message of ROS.
+        self._accepted: dict[int, tuple[Any, fipa.RemoteGoal]] = {}
+        self._server = ActionServer(
+            ros.node,
+            kind,
+            f"/{agent}/{word}",
+            execute_callback=self._execute,
+            goal_callback=self._decide,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )
+
+    def close(self) -> None:
+        """Called in the thread of ROS."""
+        self._server.destroy()
+
+    async def _decide(self, message: Any) -> GoalResponse:
+        async def invoke() -> fipa.RemoteGoal:
+            goal = self._own.invoke(self._agent, self._word, values.to_json(message))
+            await goal.accepted()
+            return goal
+
+        try:
+            goal = await self._ros.ask(invoke)
+        except (fipa.Error, Full) as error:
+            # ROS has no reason for a rejected goal.
+            _log.warning("/%s/%s: a goal is rejected: %s", self._agent, self._word, error)
+            return GoalResponse.REJECT
+        self._accepted[id(message)] = (message, goal)
+        return GoalResponse.ACCEPT
+
+    async def _execute(self, handle: Any) -> Any:
+        _, goal = self._accepted.pop(id(handle.request))
+
+        async def follow() -> Any:
+            cancelling = asyncio.ensure_future(self._cancel(handle, goal))
+            try:
+                async for progress in goal:
+                    if isinstance(value := progress.get("value"), dict):
+                        feedback = values.from_json(self._kind.Feedback, value)
+                        await self._ros.call(handle.publish_feedback, feedback)
+                return values.from_json(self._kind.Result, await goal.result() or {})
+            finally:
+                cancelling.cancel()
+
+        try:
+            result = await self._ros.ask(follow)
+        except (fipa.Error, values.Mismatch, Full) as error:
+            _log.warning("/%s/%s: %s", self._agent, self._word, error)
+            if handle.is_cancel_requested:
+                handle.canceled()
+            else:
+                handle.abort()
+            return self._kind.Result()
+        handle.succeed()
+        return result
+
+    async def _cancel(self, handle: Any, goal: fipa.RemoteGoal) -> None:
+        while not handle.is_cancel_requested:
+            await asyncio.sleep(0.05)
+        goal.cancel()
+
+
+class AgentService:
+    """The requests of an agent, as a service of ROS."""
+
+    def __init__(self, ros: Ros, own: fipa.Agent, agent: str, word: str, kind: Any) -> None:
+        self._ros = ros
+        self._own = own
+        self._agent = agent
+        self._word = word
+        self._kind = kind
+        self._service = ros.node.create_service(kind, f"/{agent}/{word}", self._answer)
+        self._send = self._service.send_response
+        # ROS has no failure of a service: a request that fails has no answer, so that no client takes it for a success.
+        self._service.send_response = self._send_if_any
+
+    def close(self) -> None:
+        """Called in the thread of ROS."""
+        self._ros.node.destroy_service(self._service)
+
+    def _send_if_any(self, response: Any, header: Any) -> None:
+        if response is not None:
+            self._send(response, header)
+
+    async def _answer(self, message: Any, _response: Any) -> Any:
+        async def request() -> Any:
+            content = sl.dumps({"@": self._word, **values.to_json(message)})
+            letter = await self._own.request(fipa.Message("request", self._agent, content, language="fipa-sl"))
+            text = letter.text
+            answer = json.loads(text) if letter.language == "json" else sl.loads(text) if text else {}
+            return values.from_json(self._kind.Response, answer if isinstance(answer, dict) else {})
+
+        try:
+            return await self._ros.ask(request)
+        except (fipa.Error, values.Mismatch, Full) as error:
+            reason = str(error)
+        _log.warning("/%s/%s: no answer: %s", self._agent, self._word, reason)
+        response = self._kind.Response()
+        if hasattr(response, "success") and hasattr(response, "message"):
+            # As in std_srvs.
+            response.message = reason
+            return response
+        return None
+
+
+class AgentTopic:
+    """A topic of an agent, as a topic of ROS."""
+
+    def __init__(self, ros: Ros, own: fipa.Agent, agent: str, word: str, kind: Any) -> None:
+        self._ros = ros
+        self._own = own
+        self._agent = agent
+        self._word = word
+        self._kind = kind
+        self._publisher = ros.node.create_publisher(kind, f"/{agent}/{word}", QoSProfile(depth=DEPTH))
+        ros.soon(self._begin)
+        self._task: asyncio.Task[None] | None = None
+
+    def close(self) -> None:
+        """Called in the thread of ROS."""
+        self._ros.soon(self._end)
+        self._ros.node.destroy_publisher(self._publisher)
+
+    def _begin(self) -> None:
+        self._task = asyncio.get_running_loop().create_task(self._follow())
+
+    def _end(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _follow(self) -> None:
+        pause = 1.0
+        while True:
+            try:
+                with self._own.subscribe(self._agent, self._word) as notifications:
+                    async for letter in notifications:
+                        pause = 1.0
+                        self._publish(letter)
+            except fipa.Error as error:
+                _log.info("/%s/%s: %s; next attempt in %.0f s", self._agent, self._word, error, pause)
+            await asyncio.sleep(pause)
+            pause = min(pause * 2, LONGEST_PAUSE)
+
+    def _publish(self, letter: fipa.Letter) -> None:
+        with letter:
+            if letter.language == "ros2-cdr":
+                if letter.ontology == types.name_of(self._kind):
+                    self._publisher.publish(bytes(letter))
+                    return
+                wrong = f"the type is {letter.ontology}"
+            else:
+                try:
+                    value = json.loads(letter.text) if letter.language == "json" else sl.loads(letter.text)
+                    self._publisher.publish(values.from_json(self._kind, value))
+                    return
+                except ValueError as error:
+                    wrong = str(error)
+        _log.warning("/%s/%s: a notification is dropped: %s", self._agent, self._word, wrong)
+
+
+#: What agents offer, by kind, as in the mapping.
+KINDS = {"actions": AgentAction, "services": AgentService, "topics": AgentTopic}

@@ -1,0 +1,182 @@
+"""The bridge: keeps what the mapping names open, as the graph of ROS changes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Any
+
+import fipa
+from fipa.ros2 import agents, graph, robots
+from fipa.ros2.graph import Entity
+from fipa.ros2.mapping import KINDS, Mapping
+from fipa.ros2.ros import Ros
+from fipa.ros2.types import UnknownType, load
+
+_log = logging.getLogger("fipa.ros2")
+
+#: Time between two looks at the graph in seconds. ROS tells nobody that a server has died.
+LOOK = 0.5
+
+#: Time until the directory is asked again, if it did not answer, in seconds.
+DIRECTORY_PAUSE = 10.0
+
+
+class _Robot:
+    """An agent of a namespace of ROS."""
+
+    def __init__(self, agent: fipa.Agent) -> None:
+        self.agent = agent
+        self.requests: robots.Requests | None = None
+        #: What is open, by kind and name of ROS.
+        self.open: dict[tuple[str, str], tuple[tuple[str, ...], robots.Mapped]] = {}
+        self.listed: set[tuple[str, str]] = set()
+
+
+class Bridge:
+    """A bridge between a domain of agents and ROS."""
+
+    def __init__(self, ros: Ros, domain: fipa.Domain, mapping: Mapping, name: str) -> None:
+        self._ros = ros
+        self._domain = domain
+        self._mapping = mapping
+        self._name = name
+        self._robots: dict[str, _Robot] = {}
+        self._foreign: list[Any] = []
+        self._tasks = robots.Tasks()
+        self._warned: set[tuple[str, str]] = set()
+        self._list_at = 0.0
+
+    async def run(self) -> None:
+        """Runs until it is cancelled, and ends what it has opened."""
+        try:
+            await self._offer_agents()
+            while True:
+                found = await self._ros.call(graph.mapped_entities, self._ros.node, self._mapping)
+                await self._follow(found)
+                await self._list()
+                await asyncio.sleep(LOOK)
+        finally:
+            await self._close()
+
+    async def _offer_agents(self) -> None:
+        """Offers the agents of the mapping to ROS. Raises `UnknownType`."""
+        if not self._mapping.agents:
+            return
+        own = await self._domain.register(self._name, type="bridge", description="fipa-ros2")
+        for agent, offered in self._mapping.agents.items():
+            for kind in KINDS:
+                for word, type_name in getattr(offered, kind).items():
+                    made = await self._ros.call(
+                        agents.KINDS[kind], self._ros, own, agent, word, load(type_name)
+                    )
+                    self._foreign.append(made)
+                    _log.info("/%s/%s is %s of the agent %s", agent, word, _one(kind), agent)
+
+    async def _follow(self, found: list[Entity]) -> None:
+        """Opens what has appeared, and closes what has gone."""
+        present = {(it.kind, it.name): it for it in found}
+        for name, robot in list(self._robots.items()):
+            for key, (types, mapped) in list(robot.open.items()):
+                entity = present.get(key)
+                if entity is not None and types == entity.types:
+                    continue
+                why = "has gone" if entity is None else f"has changed its type to {', '.join(entity.types)}"
+                _log.info("%s %s", key[1], why)
+                del robot.open[key]
+                if robot.requests is not None and key[0] == "services":
+                    robot.requests.services.pop(key[1].rsplit("/", 1)[1], None)
+                await mapped.close()
+            if not robot.open:
+                del self._robots[name]
+                self._end(robot)
+        for entity in found:
+            if not any((entity.kind, entity.name) in robot.open for robot in self._robots.values()):
+                await self._open(entity)
+
+    async def _open(self, entity: Entity) -> None:
+        if len(entity.types) > 1:
+            self._warn(entity, f"has several types: {', '.join(entity.types)}")
+            return
+        if entity.kind != "topics" and entity.servers > 1:
+            self._warn(entity, f"has {entity.servers} servers; one is expected")
+            return
+        place = self._mapping.agent_of(entity.name)
+        if place is None:
+            self._warn(entity, 'has no namespace: set `robot = "NAME"` in the mapping')
+            return
+        try:
+            kind = load(entity.types[0])
+            robot = await self._robot(place[0])
+            mapped = await self._made(entity, robot, place[1], kind)
+        except (UnknownType, fipa.Error) as error:
+            self._warn(entity, f"is not mapped: {error}")
+            return
+        robot.open[entity.kind, entity.name] = (entity.types, mapped)
+        robot.listed.clear()
+        self._list_at = 0.0
+        self._tasks.start(mapped.run())
+        _log.info("%s is %s %s of the agent %s", entity.name, _one(entity.kind), place[1], place[0])
+
+    async def _made(self, entity: Entity, robot: _Robot, word: str, kind: Any) -> robots.Mapped:
+        settings = self._mapping.of(entity.name)
+        if entity.kind == "actions":
+            return robots.Action(self._ros, robot.agent, entity.name, word, kind, settings)
+        if entity.kind == "topics":
+            return robots.Topic(self._ros, robot.agent, entity.name, word, kind, settings.content)
+        if robot.requests is None:
+            robot.requests = robots.Requests(robot.agent)
+            self._tasks.start(robot.requests.run())
+        service = robots.Service(self._ros, entity.name, kind)
+        robot.requests.services[word] = service
+        return service
+
+    async def _robot(self, name: str) -> _Robot:
+        robot = self._robots.get(name)
+        if robot is None:
+            agent = await self._domain.register(name, type="robot", description="a robot of ROS 2")
+            robot = self._robots[name] = _Robot(agent)
+        return robot
+
+    def _end(self, robot: _Robot) -> None:
+        if robot.requests is not None:
+            robot.requests.close()
+        robot.agent.deregister()
+
+    def _warn(self, entity: Entity, text: str) -> None:
+        """Warns once of each mistake."""
+        if (entity.name, text) not in self._warned and len(self._warned) < 1000:
+            self._warned.add((entity.name, text))
+            _log.warning("%s %s", entity.name, text)
+
+    async def _list(self) -> None:
+        """Lists actions and services in the directory; topics are there by themselves."""
+        loop = asyncio.get_running_loop()
+        if loop.time() < self._list_at:
+            return
+        self._list_at = loop.time() + DIRECTORY_PAUSE
+        for robot in self._robots.values():
+            for key, (types, _) in robot.open.items():
+                kind, name = key
+                if kind == "topics" or key in robot.listed:
+                    continue
+                try:
+                    await robot.agent.register_service(
+                        _one(kind), name.rsplit("/", 1)[1], properties={"ros-type": types[0]}, protocols=["fipa-request"]
+                    )
+                except fipa.Error as error:
+                    _log.debug("the directory does not list %s: %s", name, error)
+                    return
+                robot.listed.add(key)
+
+    async def _close(self) -> None:
+        for robot in self._robots.values():
+            for _, mapped in robot.open.values():
+                await mapped.close()
+            self._end(robot)
+        for made in self._foreign:
+            await self._ros.call(made.close)
+
+
+def _one(kind: str) -> str:
+    return kind[:-1]

@@ -1,0 +1,366 @@
+"""Robots of ROS as agents: their action servers, services and topics."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import uuid
+from collections.abc import Coroutine
+from typing import Any
+
+from action_msgs.msg import GoalStatus, GoalStatusArray
+from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from unique_identifier_msgs.msg import UUID
+
+import fipa
+from fipa import sl
+from fipa.ros2 import describe, graph, types, values
+from fipa.ros2.mapping import Settings
+from fipa.ros2.ros import Full, Inbox, Ros
+
+_log = logging.getLogger("fipa.ros2")
+
+#: The space of the ids of goals. A goal that its client sends again has the same id, so the server runs it once.
+SPACE = uuid.UUID("8d5a2c7e-0c53-5c0f-9a55-6b1b5a3f7d10")
+
+#: Maximum number of messages of a topic that wait for the agent.
+WAITING = 64
+
+#: Maximum number of contents that a topic keeps for new subscribers.
+LATCHED = 64
+
+_GONE = "gone: the server in ROS has died or ended"
+
+
+class Mapped:
+    """Something of ROS that an agent offers."""
+
+    async def run(self) -> None:
+        """Serves until `close`."""
+        raise NotImplementedError
+
+    async def close(self) -> None:
+        """Ends. What waits for the server ends as gone."""
+        raise NotImplementedError
+
+
+class Tasks:
+    """Running work, which the loop alone would forget."""
+
+    def __init__(self) -> None:
+        self._running: set[asyncio.Task[None]] = set()
+
+    def start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._running.add(task)
+        task.add_done_callback(self._ended)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._running.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            _log.error("a conversation has failed", exc_info=error)
+
+    async def end(self) -> None:
+        if self._running:
+            await asyncio.wait(self._running)
+
+
+class Action(Mapped):
+    """An action server of ROS, as an action of an agent."""
+
+    def __init__(self, ros: Ros, agent: fipa.Agent, name: str, word: str, kind: Any, settings: Settings) -> None:
+        self._ros = ros
+        self._kind = kind
+        self._client = ActionClient(ros.node, kind, name)
+        self._gone = asyncio.Event()
+        self._tasks = Tasks()
+        #: The goals that the server has, by id: also those of an earlier bridge.
+        self._known: dict[bytes, int] = {}
+        self._status = ros.node.create_subscription(
+            GoalStatusArray, f"{name}/_action/status", self._list_goals, _LAST_STATUS
+        )
+        self.name = name
+        self.goals = agent.goals(describe.action(word, kind, settings))
+
+    def _list_goals(self, goals: GoalStatusArray) -> None:
+        self._known = {bytes(it.goal_info.goal_id.uuid): it.status for it in goals.status_list}
+
+    async def run(self) -> None:
+        async for goal in self.goals:
+            self._tasks.start(self._pursue(goal))
+
+    async def close(self) -> None:
+        self._gone.set()
+        await self._tasks.end()
+        self.goals.close()
+        await self._ros.call(self._destroy)
+
+    def _destroy(self) -> None:
+        self._ros.node.destroy_subscription(self._status)
+        self._client.destroy()
+
+    async def _pursue(self, goal: fipa.Goal) -> None:
+        try:
+            reason = await self._lead(goal)
+        except (values.Mismatch, Full) as error:
+            reason = str(error)
+        except _Gone:
+            reason = _GONE
+        if reason is not None:
+            try:
+                goal.fail(reason)
+            except fipa.Error as error:
+                # The time for a stop is over: the client has an outcome.
+                _log.info("a goal of %s has ended before: %s", self.name, error)
+
+    async def _lead(self, goal: fipa.Goal) -> str | None:
+        """Leads a goal to its result. Returns the reason of a failure."""
+        message = values.from_json(self._kind.Goal, goal.arguments)
+        if self._ros.node.count_services(f"{self.name}/_action/send_goal") > 1:
+            return f"{self.name} has more than one action server"
+        identity = UUID(uuid=list(uuid.uuid5(SPACE, f"{goal.client}\n{goal.id}").bytes))
+        feedback = Inbox(self._ros, 1)
+        gone = asyncio.ensure_future(self._gone.wait())
+        stopped = asyncio.ensure_future(_wait(goal.stopped()))
+        reporting = asyncio.ensure_future(_report(goal, feedback))
+        result: asyncio.Future[Any] | None = None
+        try:
+            sent = self._ros.call(self._send, message, feedback, identity)
+            handle = await _unless(gone, asyncio.ensure_future(sent))
+            if not handle.accepted:
+                if bytes(identity.uuid) not in self._known:
+                    return "the action server rejects the goal"
+                # A bridge that has died sent it.
+                handle = ClientGoalHandle(self._client, identity, _ACCEPTED(self._kind))
+            goal.accept()
+            result = asyncio.ensure_future(self._ros.call(handle.get_result_async))
+            await asyncio.wait({result, gone, stopped}, return_when=asyncio.FIRST_COMPLETED)
+            if stopped.done() and not result.done():
+                await _unless(gone, asyncio.ensure_future(self._ros.call(handle.cancel_goal_async)))
+            return _end(goal, await _unless(gone, result))
+        finally:
+            for task in (gone, stopped, reporting, result):
+                if task is not None:
+                    task.cancel()
+
+    def _send(self, message: Any, feedback: Inbox, identity: UUID) -> Any:
+        return self._client.send_goal_async(message, lambda it: feedback.put(it.feedback), identity)
+
+
+#: Of the status of an action.
+_LAST_STATUS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+
+def _ACCEPTED(kind: Any) -> Any:
+    return kind.Impl.SendGoalService.Response(accepted=True)
+
+
+class _Gone(Exception):
+    """The server has died."""
+
+
+async def _wait(pending: Any) -> Any:
+    return await pending
+
+
+async def _report(goal: fipa.Goal, feedback: Inbox) -> None:
+    while True:
+        message = await feedback.get()
+        goal.progress(value=values.to_json(message))
+
+
+async def _unless(gone: asyncio.Future[Any], work: asyncio.Future[Any]) -> Any:
+    """Waits for the work, unless the server dies. Raises `_Gone`."""
+    await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
+    if not work.done():
+        work.cancel()
+        raise _Gone
+    return work.result()
+
+
+def _end(goal: fipa.Goal, response: Any) -> str | None:
+    result = values.to_json(response.result)
+    if response.status == GoalStatus.STATUS_SUCCEEDED:
+        goal.succeed(result)
+        return None
+    if response.status == GoalStatus.STATUS_CANCELED:
+        return goal.stop_reason or "the action server has canceled the goal"
+    if response.status == GoalStatus.STATUS_UNKNOWN:
+        return "the action server does not know the goal any more"
+    return f"the action server has aborted the goal: {json.dumps(result)[:500]}"
+
+
+class Service(Mapped):
+    """A service of ROS: requests whose content is its name with the arguments, `(set_bool :data true)`."""
+
+    def __init__(self, ros: Ros, name: str, kind: Any) -> None:
+        self._ros = ros
+        self._kind = kind
+        self._client = ros.node.create_client(kind, name)
+        self._gone = asyncio.Event()
+        self._closed = asyncio.Event()
+
+    async def run(self) -> None:
+        await self._closed.wait()
+
+    async def close(self) -> None:
+        self._gone.set()
+        self._closed.set()
+        await self._ros.call(self._ros.node.destroy_client, self._client)
+
+    async def answer(self, task: fipa.Task, arguments: dict[str, Any]) -> None:
+        """Answers a request."""
+        try:
+            message = values.from_json(self._kind.Request, arguments)
+        except values.Mismatch as error:
+            await task.refuse(str(error))
+            return
+        await task.agree()
+        gone = asyncio.ensure_future(self._gone.wait())
+        work = asyncio.ensure_future(self._ros.call(self._client.call_async, message))
+        cancelled = asyncio.ensure_future(_wait(task.cancelled()))
+        try:
+            await asyncio.wait({work, gone, cancelled}, return_when=asyncio.FIRST_COMPLETED)
+            if work.done():
+                await task.inform(written(task.letter, values.to_json(work.result())))
+            elif gone.done():
+                await task.fail(_GONE)
+            else:
+                # ROS has no cancel of a service: its answer is ignored.
+                await task.inform("cancelled")
+        except Full as error:
+            await task.fail(str(error))
+        finally:
+            for each in (gone, work, cancelled):
+                each.cancel()
+
+
+class Requests:
+    """The requests of an agent, for its services."""
+
+    def __init__(self, agent: fipa.Agent) -> None:
+        self.services: dict[str, Service] = {}
+        self._tasks = Tasks()
+        self._requests = agent.tasks("fipa-request")
+
+    async def run(self) -> None:
+        async for task in self._requests:
+            self._tasks.start(self._answer(task))
+
+    def close(self) -> None:
+        self._requests.close()
+
+    async def _answer(self, task: fipa.Task) -> None:
+        try:
+            word, arguments = read(task.letter)
+            service = self.services.get(word)
+            if service is None:
+                known = ", ".join(sorted(self.services)) or "none"
+                await task.refuse(f"{word!r} is no service of this agent; its services: {known}")
+            else:
+                await service.answer(task, arguments)
+        except ValueError as error:
+            await task.refuse(f"expected a service with its arguments, such as (set_bool :data true): {error}")
+        except fipa.Error as error:
+            # The client is gone.
+            _log.info("a request has ended: %s", error)
+
+
+def read(letter: fipa.Letter) -> tuple[str, dict[str, Any]]:
+    """Reads the content of a request: `(set_bool :data true)` in SL, `{"@": "set_bool", "data": true}` in JSON."""
+    value = json.loads(letter.text) if letter.language == "json" else sl.loads(letter.text)
+    if isinstance(value, str):
+        return value, {}
+    if not isinstance(value, dict) or not isinstance(word := value.pop("@", None), str):
+        raise ValueError("the content has no name")
+    return word, value
+
+
+def written(letter: fipa.Letter, value: dict[str, Any]) -> str:
+    """Writes an answer in the language of the question."""
+    return json.dumps(value) if letter.language == "json" else sl.dumps(value)
+
+
+class Topic(Mapped):
+    """A topic of ROS, as a topic of an agent."""
+
+    def __init__(self, ros: Ros, agent: fipa.Agent, name: str, word: str, kind: Any, content: str) -> None:
+        self._ros = ros
+        self.name = name
+        self._is_raw = content == "cdr"
+        reliability, durability, depth = graph.quality(ros.node, name)
+        keeps = durability == DurabilityPolicy.TRANSIENT_LOCAL
+        self._inbox = Inbox(ros, WAITING)
+        self._publisher = agent.publisher(
+            word,
+            language="ros2-cdr" if self._is_raw else "json",
+            ontology=types.name_of(kind),
+            latched=min(max(depth, 1), LATCHED) if keeps else 0,
+        )
+        profile = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=min(max(depth, 10), WAITING),
+            reliability=reliability,
+            durability=durability,
+        )
+        self._subscription = ros.node.create_subscription(
+            kind, name, self._inbox.put, profile, raw=self._is_raw, event_callbacks=mismatch(ros, name)
+        )
+        self._task: asyncio.Task[None] | None = None
+
+    async def run(self) -> None:
+        self._task = asyncio.current_task()
+        dropped, warned_at = 0, 1
+        while True:
+            message = await self._inbox.get()
+            if self._is_raw:
+                with memoryview(message) as content:
+                    loan = self._publisher.loan(len(content))
+                    with memoryview(loan) as place:
+                        place[:] = content
+                await loan.publish()
+            else:
+                await self._publisher.publish(json.dumps(values.to_json(message)).encode())
+            dropped = self._inbox.dropped
+            if dropped >= warned_at:
+                warned_at = dropped * 2
+                _log.warning("%s: %d messages were dropped, because subscribers are slow", self.name, dropped)
+
+    async def close(self) -> None:
+        await self._ros.call(self._ros.node.destroy_subscription, self._subscription)
+        if self._task is not None:
+            self._task.cancel()
+        self._publisher.close()
+
+
+def mismatch(ros: Ros, name: str) -> Any:
+    """Warns once when the policies of a publisher do not fit those of the bridge."""
+    from rclpy.event_handler import SubscriptionEventCallbacks
+
+    warned = False
+
+    def warn(event: Any) -> None:
+        nonlocal warned
+        if warned:
+            return
+        warned = True
+        ends = ros.node.get_publishers_info_by_topic(name) + ros.node.get_subscriptions_info_by_topic(name)
+        policies = "; ".join(f"{end.node_name}: {_policies(end.qos_profile)}" for end in ends)
+        _log.warning("%s: policies that do not fit (%s): %s", name, event.last_policy_kind, policies)
+
+    return SubscriptionEventCallbacks(incompatible_qos=warn)
+
+
+def _policies(profile: Any) -> str:
+    return f"{profile.reliability.name.lower()}, {profile.durability.name.lower()}"
+
+
+

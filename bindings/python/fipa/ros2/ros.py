@@ -1,0 +1,171 @@
+"""The node of the bridge, and the thread in which its callbacks run.
+
+The loop of the agents and the thread of ROS meet in two bounded queues: the calls of `Ros.call`, and `Inbox`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+_log = logging.getLogger("fipa.ros2")
+
+#: The beginning of the names of nodes of bridges. A bridge does not map what another one offers.
+NODE = "fipa_bridge"
+
+#: Maximum number of calls in each direction that wait. Further ones are refused.
+MAX_CALLS = 256
+
+
+class Full(Exception):
+    """Too many calls wait already."""
+
+
+class Ros:
+    """The node of the bridge. Its callbacks run in one thread, and `call` runs functions there."""
+
+    def __init__(self, arguments: Sequence[str], loop: asyncio.AbstractEventLoop) -> None:
+        # The loop handles the signals.
+        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+        self.node: Node = rclpy.create_node(NODE, enable_rosout=False, start_parameter_services=False)
+        self.loop = loop
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._calls = 0
+        self._asked = 0
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._spin, name="ros", daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        while not self._is_closed:
+            try:
+                self._executor.spin_once(timeout_sec=1.0)
+            except ExternalShutdownException:
+                return
+            except Exception:
+                # One callback has failed; the others go on.
+                _log.exception("a callback of ROS has failed")
+
+    def close(self) -> None:
+        self._is_closed = True
+        self._executor.wake()
+        self._thread.join()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+    async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Calls a function in the thread of ROS. Awaits its result, if that is a future of rclpy. Raises `Full`."""
+        if self._calls >= MAX_CALLS:
+            raise Full(f"{MAX_CALLS} calls wait for ROS already")
+        done: asyncio.Future[Any] = self.loop.create_future()
+
+        def settle(future: Future[Any]) -> None:
+            error = future.exception()
+            self.soon(_settle, done, None if error else future.result(), error)
+
+        def run() -> None:
+            try:
+                result = function(*arguments)
+            except Exception as error:
+                self.soon(_settle, done, None, error)
+                return
+            if isinstance(result, Future):
+                result.add_done_callback(settle)
+            else:
+                self.soon(_settle, done, result, None)
+
+        self._calls += 1
+        try:
+            self._executor.create_task(run)
+            return await done
+        finally:
+            self._calls -= 1
+
+    async def ask(self, work: Callable[[], Coroutine[Any, Any, Any]]) -> Any:
+        """Runs a coroutine in the loop of the agents, for a callback in the thread of ROS. Raises `Full`."""
+        if self._asked >= MAX_CALLS:
+            raise Full(f"{MAX_CALLS} calls wait for agents already")
+        answer: Future[Any] = Future(executor=self._executor)
+
+        async def run() -> None:
+            try:
+                result, error = await work(), None
+            except Exception as caught:
+                result, error = None, caught
+            # In the thread of ROS, so that the executor wakes up.
+            self._executor.create_task(answer.set_exception if error else answer.set_result, error or result)
+
+        self._asked += 1
+        try:
+            self.soon(lambda: _keep(self.loop.create_task(run())))
+            return await answer
+        finally:
+            self._asked -= 1
+
+    def soon(self, function: Callable[..., Any], *arguments: Any) -> None:
+        """Calls a function in the loop; not if the loop is closed."""
+        try:
+            self.loop.call_soon_threadsafe(function, *arguments)
+        except RuntimeError:
+            pass
+
+
+#: The loop has only weak references to its tasks.
+_kept: set[asyncio.Task[Any]] = set()
+
+
+def _keep(task: asyncio.Task[Any]) -> None:
+    _kept.add(task)
+    task.add_done_callback(_kept.discard)
+
+
+def _settle(done: asyncio.Future[Any], result: Any, error: BaseException | None) -> None:
+    if done.done():
+        return
+    if error is None:
+        done.set_result(result)
+    else:
+        done.set_exception(error)
+
+
+class Inbox:
+    """A bounded queue from the thread of ROS to the loop. A full one drops its oldest item, and counts it."""
+
+    def __init__(self, ros: Ros, bound: int) -> None:
+        self._ros = ros
+        self._items: deque[Any] = deque()
+        self._bound = bound
+        self._lock = threading.Lock()
+        self._ready = asyncio.Event()
+        self.dropped = 0
+
+    def put(self, item: Any) -> None:
+        """Called in the thread of ROS."""
+        with self._lock:
+            if len(self._items) == self._bound:
+                self._items.popleft()
+                self.dropped += 1
+            self._items.append(item)
+            wakes = len(self._items) == 1
+        if wakes:
+            self._ros.soon(self._ready.set)
+
+    async def get(self) -> Any:
+        while True:
+            with self._lock:
+                if self._items:
+                    return self._items.popleft()
+                self._ready.clear()
+            await self._ready.wait()
