@@ -84,17 +84,22 @@ pub fn can_import(name: &str, modules: &[&str]) -> bool {
     is_complete(name, &missing)
 }
 
-/// Puts the package `fipa` for Python into a directory, with the module that cargo has built.
-pub fn install_package(into: &Path) {
-    let to = into.join("fipa");
-    fs::create_dir(&to).expect("a directory");
-    for source in fs::read_dir(bindings("python/fipa")).expect("the sources are there") {
+fn copy_sources(from: &Path, to: &Path) {
+    fs::create_dir(to).expect("a directory");
+    for source in fs::read_dir(from).expect("the sources are there") {
         let source = source.expect("an entry").path();
         if source.is_file() {
             let name = source.file_name().expect("a name");
             fs::copy(&source, to.join(name)).expect("the source can be copied");
         }
     }
+}
+
+/// Puts the package `fipa` for Python into a directory, with the module that cargo has built.
+pub fn install_package(into: &Path) {
+    let to = into.join("fipa");
+    copy_sources(&bindings("python/fipa"), &to);
+    copy_sources(&bindings("python/fipa/ros2"), &to.join("ros2"));
     let module = libraries().join("libfipa_python.so");
     symlink(module, to.join("_native.abi3.so")).expect("a link");
 }

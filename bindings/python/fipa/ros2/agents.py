@@ -18,7 +18,7 @@ from fipa.ros2.ros import Full, Ros
 _log = logging.getLogger("fipa.ros2")
 
 #: Longest time between two attempts to subscribe to a topic of an agent, in seconds.
-LONGEST_PAUSE = 30.0
+LONGEST_PAUSE = 5.0
 
 #: Depth of the queue of a publisher.
 DEPTH = 10
@@ -123,7 +123,9 @@ class AgentService:
             letter = await self._own.request(fipa.Message("request", self._agent, content, language="fipa-sl"))
             text = letter.text
             answer = json.loads(text) if letter.language == "json" else sl.loads(text) if text else {}
-            return values.from_json(self._kind.Response, answer if isinstance(answer, dict) else {})
+            if isinstance(answer, dict):
+                answer.pop("@", None)
+            return values.from_json(self._kind.Response, answer)
 
         try:
             return await self._ros.ask(request)

@@ -6,6 +6,9 @@ import asyncio
 import logging
 from typing import Any
 
+from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import GetState
+
 import fipa
 from fipa.ros2 import agents, graph, robots
 from fipa.ros2.graph import Entity
@@ -33,6 +36,32 @@ class _Robot:
         self.listed: set[tuple[str, str]] = set()
 
 
+class _Lifecycles:
+    """The states of the lifecycle nodes, whose mappings exist while they are active."""
+
+    def __init__(self, ros: Ros) -> None:
+        self._ros = ros
+        self._clients: dict[str, Any] = {}
+
+    async def inactive(self, nodes: set[str]) -> set[str]:
+        """Returns those of the nodes that are not active, or do not answer."""
+        for node in set(self._clients) - nodes:
+            await self._ros.call(self._ros.node.destroy_client, self._clients.pop(node))
+        active = await asyncio.gather(*(self._is_active(node) for node in nodes))
+        return {node for node, is_active in zip(nodes, active, strict=True) if not is_active}
+
+    async def _is_active(self, node: str) -> bool:
+        if node not in self._clients:
+            create = self._ros.node.create_client
+            self._clients[node] = await self._ros.call(create, GetState, f"{node}/get_state")
+        try:
+            asked = self._ros.call(self._clients[node].call_async, GetState.Request())
+            answer = await asyncio.wait_for(asked, LOOK)
+        except asyncio.TimeoutError:
+            return False
+        return bool(answer.current_state.id == State.PRIMARY_STATE_ACTIVE)
+
+
 class Bridge:
     """A bridge between a domain of agents and ROS."""
 
@@ -46,6 +75,7 @@ class Bridge:
         self._tasks = robots.Tasks()
         self._warned: set[tuple[str, str]] = set()
         self._list_at = 0.0
+        self._lifecycles = _Lifecycles(ros)
 
     async def run(self) -> None:
         """Runs until it is cancelled, and ends what it has opened."""
@@ -53,7 +83,8 @@ class Bridge:
             await self._offer_agents()
             while True:
                 found = await self._ros.call(graph.mapped_entities, self._ros.node, self._mapping)
-                await self._follow(found)
+                inactive = await self._lifecycles.inactive({node for it in found for node in it.lifecycle})
+                await self._follow([it for it in found if inactive.isdisjoint(it.lifecycle)])
                 await self._list()
                 await asyncio.sleep(LOOK)
         finally:

@@ -8,6 +8,7 @@ from typing import Any
 
 from rclpy.action import get_action_names_and_types
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from fipa.ros2.mapping import Mapping
 from fipa.ros2.ros import NODE
@@ -15,7 +16,6 @@ from fipa.ros2.ros import NODE
 #: Services of the packages that control nodes: parameters, lifecycle, components. `--list` comments them out.
 CONTROLS = ("rcl_interfaces", "lifecycle_msgs", "type_description_interfaces", "composition_interfaces")
 
-_LIFECYCLE = "lifecycle_msgs/srv/GetState"
 _SEND_GOAL = "/_action/send_goal"
 
 
@@ -92,8 +92,6 @@ def _is_bridge(name: str) -> bool:
 
 def quality(node: Node, name: str) -> tuple[Any, Any, int]:
     """Reliability, durability and depth for a subscription that every publisher of a topic fits."""
-    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-
     profiles = [it.qos_profile for it in node.get_publishers_info_by_topic(name)]
     reliable = all(it.reliability == ReliabilityPolicy.RELIABLE for it in profiles)
     local = all(it.durability == DurabilityPolicy.TRANSIENT_LOCAL for it in profiles)

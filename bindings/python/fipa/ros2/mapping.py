@@ -26,15 +26,10 @@
 from __future__ import annotations
 
 import fnmatch
-import sys
+import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 
 class WrongMapping(ValueError):

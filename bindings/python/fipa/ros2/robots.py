@@ -7,11 +7,12 @@ import json
 import logging
 import uuid
 from collections.abc import Coroutine
-from typing import Any
+from typing import Any, Protocol
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from unique_identifier_msgs.msg import UUID
 
@@ -35,16 +36,14 @@ LATCHED = 64
 _GONE = "gone: the server in ROS has died or ended"
 
 
-class Mapped:
+class Mapped(Protocol):
     """Something of ROS that an agent offers."""
 
     async def run(self) -> None:
         """Serves until `close`."""
-        raise NotImplementedError
 
     async def close(self) -> None:
         """Ends. What waits for the server ends as gone."""
-        raise NotImplementedError
 
 
 class Tasks:
@@ -68,7 +67,7 @@ class Tasks:
             await asyncio.wait(self._running)
 
 
-class Action(Mapped):
+class Action:
     """An action server of ROS, as an action of an agent."""
 
     def __init__(self, ros: Ros, agent: fipa.Agent, name: str, word: str, kind: Any, settings: Settings) -> None:
@@ -134,7 +133,8 @@ class Action(Mapped):
                 if bytes(identity.uuid) not in self._known:
                     return "the action server rejects the goal"
                 # A bridge that has died sent it.
-                handle = ClientGoalHandle(self._client, identity, _ACCEPTED(self._kind))
+                accepted = self._kind.Impl.SendGoalService.Response(accepted=True)
+                handle = ClientGoalHandle(self._client, identity, accepted)
             goal.accept()
             result = asyncio.ensure_future(self._ros.call(handle.get_result_async))
             await asyncio.wait({result, gone, stopped}, return_when=asyncio.FIRST_COMPLETED)
@@ -157,10 +157,6 @@ _LAST_STATUS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-
-
-def _ACCEPTED(kind: Any) -> Any:
-    return kind.Impl.SendGoalService.Response(accepted=True)
 
 
 class _Gone(Exception):
@@ -198,7 +194,7 @@ def _end(goal: fipa.Goal, response: Any) -> str | None:
     return f"the action server has aborted the goal: {json.dumps(result)[:500]}"
 
 
-class Service(Mapped):
+class Service:
     """A service of ROS: requests whose content is its name with the arguments, `(set_bool :data true)`."""
 
     def __init__(self, ros: Ros, name: str, kind: Any) -> None:
@@ -289,7 +285,7 @@ def written(letter: fipa.Letter, value: dict[str, Any]) -> str:
     return json.dumps(value) if letter.language == "json" else sl.dumps(value)
 
 
-class Topic(Mapped):
+class Topic:
     """A topic of ROS, as a topic of an agent."""
 
     def __init__(self, ros: Ros, agent: fipa.Agent, name: str, word: str, kind: Any, content: str) -> None:
@@ -341,10 +337,8 @@ class Topic(Mapped):
         self._publisher.close()
 
 
-def mismatch(ros: Ros, name: str) -> Any:
+def mismatch(ros: Ros, name: str) -> SubscriptionEventCallbacks:
     """Warns once when the policies of a publisher do not fit those of the bridge."""
-    from rclpy.event_handler import SubscriptionEventCallbacks
-
     warned = False
 
     def warn(event: Any) -> None:

@@ -102,7 +102,7 @@ def from_json(message_type: Any, value: Any, path: str = "") -> Any:
     for name, part in value.items():
         at = f"{path}.{name}" if path else name
         if name not in known:
-            raise Mismatch(at, f"one of {', '.join(known) or 'no fields'}", name)
+            raise Mismatch(at, f"a field of {', '.join(known) or 'none'}", name)
         setattr(message, name, _read(part, known[name], at))
     return message
 
