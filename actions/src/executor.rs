@@ -79,6 +79,8 @@ pub struct OfferOptions {
     pub orphans: Orphans,
     /// The check of fences; without it, goals with a fence are refused.
     pub gate: Option<Gate>,
+    /// Whether the handler decides about each goal. The client gets no agree before [`Executor::accept`].
+    pub decides: bool,
     /// A check of arguments beyond the description, for example whether they are values of a Rust type.
     pub check: Option<Check>,
 }
@@ -92,6 +94,7 @@ impl Default for OfferOptions {
             concurrency: 1,
             orphans: Orphans::default(),
             gate: None,
+            decides: false,
             check: None,
         }
     }
@@ -102,6 +105,7 @@ impl fmt::Debug for OfferOptions {
         f.debug_struct("OfferOptions")
             .field("concurrency", &self.concurrency)
             .field("orphans", &self.orphans)
+            .field("decides", &self.decides)
             .finish_non_exhaustive()
     }
 }
@@ -158,6 +162,15 @@ impl Cause {
     }
 }
 
+/// Returns the refusal of a goal that has failed before the client got an agree.
+fn refusal(failure: Failure) -> Refusal {
+    match failure {
+        Failure::Failed(reason) => Refusal::Rejected(reason),
+        Failure::StaleFence(fence, _) => Refusal::StaleFence(fence),
+        other => Refusal::Rejected(other.to_string()),
+    }
+}
+
 /// A step that the caller has to take.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
@@ -176,7 +189,21 @@ pub enum Output {
         /// The goal.
         goal: u64,
     },
-    /// Tell the client the end of the goal.
+    /// Tell the client that the goal is accepted.
+    Agree {
+        /// The conversation.
+        conversation: u64,
+        /// Whether the goal waits in the queue.
+        queued: bool,
+    },
+    /// Tell the client that the goal is refused. The conversation has no further output.
+    Refuse {
+        /// The conversation.
+        conversation: u64,
+        /// The reason.
+        reason: Refusal,
+    },
+    /// Tell the client the end of the goal. An [`Agree`](Self::Agree) precedes it.
     Finish {
         /// The conversation.
         conversation: u64,
@@ -266,6 +293,8 @@ struct Record {
     action: String,
     digest: u64,
     conversations: Vec<u64>,
+    /// Whether its clients were told that it is accepted.
+    agreed: bool,
     state: State,
     arguments: Vec<Parameter<'static>>,
     fence: Option<String>,
@@ -356,8 +385,8 @@ impl Executor {
     }
 
     /// Handles a goal of a client, in a new conversation with a number of the caller's choice. `id` is
-    /// that of the goal. Returns whether the goal waits in the queue. A goal that the client has sent
-    /// before does not run again: its outcome also goes to this conversation.
+    /// that of the goal. [`Output::Agree`] follows at once, or when the handler accepts the goal if it decides.
+    /// A goal that the client has sent before does not run again: its outcome also goes to this conversation.
     ///
     /// # Errors
     /// If the goal is refused. The conversation then has no further output.
@@ -368,7 +397,7 @@ impl Executor {
         client: &str,
         id: &str,
         goal: Goal,
-    ) -> Result<bool, Refusal> {
+    ) -> Result<(), Refusal> {
         let Some(offer) = self.offers.get_mut(&goal.action) else {
             return Err(Refusal::UnknownAction(short(&goal.action)));
         };
@@ -438,6 +467,7 @@ impl Executor {
             action: goal.action.clone(),
             digest,
             conversations: vec![conversation],
+            agreed: false,
             state: State::Waiting,
             arguments,
             fence: goal.fence,
@@ -463,63 +493,94 @@ impl Executor {
         if let Some(deadline) = goal.deadline {
             self.set_timer(number, Timer::Deadline, Some(now.saturating_add(deadline)));
         }
-        let policy = self.offers.get_mut(&goal.action).map(|offer| {
+        let admitted = self.offers.get_mut(&goal.action).map(|offer| {
             offer.waiting.push_back(number);
-            offer.description.policy
+            (offer.description.policy, offer.options.decides)
         });
+        let (policy, decides) = admitted.unzip();
         if !is_free && policy == Some(Policy::Preempt) {
             self.preempt(now, &goal.action, number);
         }
         self.start_waiting(now, &goal.action);
-        let waits = self
-            .goals
-            .get(&number)
-            .is_some_and(|it| it.state == State::Waiting);
-        if waits {
+        if decides != Some(true) {
+            self.agree(number);
+        }
+        let record = self.goals.get(&number);
+        if record.is_some_and(|it| it.state == State::Waiting) {
             self.outputs.push_back(Output::Changed { goal: number });
         }
-        Ok(waits)
+        Ok(())
+    }
+
+    /// Handles that the handler accepts a goal about which it decides. Without effect on a goal that is accepted, or
+    /// has ended.
+    pub fn accept(&mut self, goal: u64) {
+        let record = self.goals.get(&goal);
+        if record.is_some_and(|it| matches!(it.state, State::Running | State::Stopping(_))) {
+            self.agree(goal);
+        }
+    }
+
+    /// Tells the clients of an open goal that it is accepted, unless they know it.
+    fn agree(&mut self, goal: u64) {
+        let Some(record) = self.goals.get_mut(&goal) else {
+            return;
+        };
+        if std::mem::replace(&mut record.agreed, true) {
+            return;
+        }
+        let queued = record.state == State::Waiting;
+        for &conversation in &record.conversations {
+            self.outputs.push_back(Output::Agree {
+                conversation,
+                queued,
+            });
+        }
     }
 
     /// Joins a conversation to a goal that is known already.
-    fn repeat(&mut self, goal: u64, conversation: u64, digest: u64) -> Result<bool, Refusal> {
+    fn repeat(&mut self, goal: u64, conversation: u64, digest: u64) -> Result<(), Refusal> {
         let Some(record) = self.goals.get_mut(&goal) else {
             return Err(Refusal::TooManyGoals);
         };
         if record.digest != digest {
             return Err(Refusal::UsedId(record.id.clone()));
         }
-        match &record.state {
-            State::Ended(outcome) => {
-                let outcome = outcome.clone();
-                self.outputs.push_back(Output::Finish {
-                    conversation,
-                    outcome,
-                });
-                Ok(false)
+        let outcome = match &record.state {
+            State::Ended(Err(failure)) if !record.agreed => return Err(refusal(failure.clone())),
+            State::Forgotten if !record.agreed => {
+                return Err(Refusal::Rejected(
+                    "the reason is not stored any more".to_owned(),
+                ));
             }
-            State::Forgotten => {
-                let outcome = Err(Failure::Forgotten);
-                self.outputs.push_back(Output::Finish {
-                    conversation,
-                    outcome,
-                });
-                Ok(false)
+            State::Ended(outcome) => Some(outcome.clone()),
+            State::Forgotten => Some(Err(Failure::Forgotten)),
+            _ => None,
+        };
+        if outcome.is_none() {
+            let client = self.clients.entry(Arc::clone(&record.client)).or_default();
+            if record.conversations.len() >= MAX_CONVERSATIONS
+                || client.conversations >= self.limits.goals_of_client
+            {
+                return Err(Refusal::TooManyGoals);
             }
-            state => {
-                let client = self.clients.entry(Arc::clone(&record.client)).or_default();
-                if record.conversations.len() >= MAX_CONVERSATIONS
-                    || client.conversations >= self.limits.goals_of_client
-                {
-                    return Err(Refusal::TooManyGoals);
-                }
-                client.conversations += 1;
-                let waits = *state == State::Waiting;
-                record.conversations.push(conversation);
-                self.conversations.insert(conversation, goal);
-                Ok(waits)
-            }
+            client.conversations += 1;
+            record.conversations.push(conversation);
+            self.conversations.insert(conversation, goal);
         }
+        if record.agreed {
+            self.outputs.push_back(Output::Agree {
+                conversation,
+                queued: record.state == State::Waiting,
+            });
+        }
+        if let Some(outcome) = outcome {
+            self.outputs.push_back(Output::Finish {
+                conversation,
+                outcome,
+            });
+        }
+        Ok(())
     }
 
     /// Handles a cancel of the client.
@@ -865,6 +926,9 @@ impl Executor {
         for timer in [Timer::Deadline, Timer::Abort, Timer::Progress] {
             self.set_timer(goal, timer, None);
         }
+        if outcome.is_ok() {
+            self.agree(goal);
+        }
         let Some(record) = self.goals.get_mut(&goal) else {
             return;
         };
@@ -872,10 +936,15 @@ impl Executor {
         let count = conversations.len();
         for conversation in conversations {
             self.conversations.remove(&conversation);
-            let outcome = outcome.clone();
-            self.outputs.push_back(Output::Finish {
-                conversation,
-                outcome,
+            self.outputs.push_back(match (&outcome, record.agreed) {
+                (Err(failure), false) => Output::Refuse {
+                    conversation,
+                    reason: refusal(failure.clone()),
+                },
+                _ => Output::Finish {
+                    conversation,
+                    outcome: outcome.clone(),
+                },
             });
         }
         self.outputs.push_back(Output::Changed { goal });

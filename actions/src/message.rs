@@ -233,6 +233,9 @@ pub enum Refusal {
     /// The client used the id for another goal.
     #[error("the goal id {} belongs to another goal", escape(.0))]
     UsedId(String),
+    /// The robot has looked at the goal and does not accept it. Holds the reason.
+    #[error("the robot rejects the goal: {}", escape(.0))]
+    Rejected(String),
 }
 
 /// The reason for which an action failed.

@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
+use std::collections::HashMap;
+
 use fipa_actions::{
     ActionDescription, ActionLimits, Cause, Executor, Failure, Goal, GoalRef, GoalState,
     MAX_PROGRESS, OfferOptions, OfferRefused, Orphans, Output, ParameterDescription, Policy,
@@ -33,11 +35,11 @@ fn goal(arguments: &str) -> Goal {
     Goal::of("drive", term.parameters().to_vec())
 }
 
-/// Returns the outputs, without the changes of the status.
+/// Returns the outputs, without the changes of the status and the agrees.
 fn outputs(executor: &mut Executor) -> Vec<Output> {
     let all = std::iter::from_fn(|| executor.poll_output());
-    all.filter(|output| !matches!(output, Output::Changed { .. }))
-        .collect()
+    let told = all.filter(|it| !matches!(it, Output::Changed { .. } | Output::Agree { .. }));
+    told.collect()
 }
 
 /// Requires the start of a goal, and returns its number.
@@ -59,7 +61,7 @@ fn finish(conversation: u64, outcome: Result<Option<Term<'static>>, Failure>) ->
 #[test]
 fn a_goal_runs_with_its_defaults_and_its_outcome_reaches_its_conversation() {
     let mut executor = with(Policy::Reject);
-    assert_eq!(executor.request(0, 1, "rover", "a", goal("")), Ok(false));
+    assert_eq!(executor.request(0, 1, "rover", "a", goal("")), Ok(()));
     let [Output::Start(running)] = &outputs(&mut executor)[..] else {
         panic!()
     };
@@ -104,7 +106,7 @@ fn a_refusal_names_the_parameter_and_the_reason() {
         assert_eq!(refused, Err(expected), "{arguments}");
     }
     let known_unit = goal(":speed (quantity :value 0.3 :unit m/s)");
-    assert_eq!(executor.request(0, 1, "rover", "a", known_unit), Ok(false));
+    assert_eq!(executor.request(0, 1, "rover", "a", known_unit), Ok(()));
     let other = Goal::of("fly", Vec::new());
     let unknown = executor.request(0, 2, "rover", "b", other);
     assert_eq!(unknown, Err(Refusal::UnknownAction(text("fly"))));
@@ -126,7 +128,7 @@ fn the_policies_reject_queue_and_preempt() {
     let mut executor = with(Policy::Queue(1));
     executor.request(0, 1, "rover", "a", goal("")).unwrap();
     let first = started(&mut executor);
-    assert_eq!(executor.request(0, 2, "rover", "b", goal("")), Ok(true));
+    assert_eq!(executor.request(0, 2, "rover", "b", goal("")), Ok(()));
     let full = executor.request(0, 3, "rover", "c", goal(""));
     assert_eq!(full, Err(Refusal::QueueFull("drive".to_owned())));
     assert_eq!(executor.status(9)[1].state, GoalState::Queued);
@@ -137,14 +139,14 @@ fn the_policies_reject_queue_and_preempt() {
     let mut executor = with(Policy::Preempt);
     executor.request(0, 1, "rover", "a", goal("")).unwrap();
     let first = started(&mut executor);
-    assert_eq!(executor.request(0, 2, "arm", "b", goal("")), Ok(true));
+    assert_eq!(executor.request(0, 2, "arm", "b", goal("")), Ok(()));
     let stop = Output::Stop {
         goal: first,
         cause: Cause::Preempted,
     };
     assert_eq!(outputs(&mut executor), [stop]);
     // The goal that waits gives way to a third one.
-    assert_eq!(executor.request(0, 3, "rover", "c", goal("")), Ok(true));
+    assert_eq!(executor.request(0, 3, "rover", "c", goal("")), Ok(()));
     assert_eq!(outputs(&mut executor), [finish(2, Err(Failure::Preempted))]);
     executor.ended(1, first, Err(Failure::Failed("stopped".to_owned())));
     let all = outputs(&mut executor);
@@ -158,7 +160,7 @@ fn a_goal_that_is_sent_again_runs_once() {
     executor.request(0, 1, "rover", "a", goal("")).unwrap();
     let number = started(&mut executor);
     // The client sends it again while it runs.
-    assert_eq!(executor.request(1, 2, "rover", "a", goal("")), Ok(false));
+    assert_eq!(executor.request(1, 2, "rover", "a", goal("")), Ok(()));
     assert_eq!(outputs(&mut executor), []);
     executor.gone(2, 1);
     assert_eq!(
@@ -185,6 +187,187 @@ fn a_goal_that_is_sent_again_runs_once() {
         .request(4 + retention, 6, "rover", "a", goal(""))
         .unwrap();
     started(&mut executor);
+}
+
+/// Returns what the clients are told.
+fn told(executor: &mut Executor) -> Vec<Output> {
+    let all = std::iter::from_fn(|| executor.poll_output());
+    let told = all.filter(|it| {
+        matches!(
+            it,
+            Output::Agree { .. } | Output::Refuse { .. } | Output::Finish { .. }
+        )
+    });
+    told.collect()
+}
+
+fn agree(conversation: u64, queued: bool) -> Output {
+    Output::Agree {
+        conversation,
+        queued,
+    }
+}
+
+fn refuse(conversation: u64, reason: &str) -> Output {
+    let reason = Refusal::Rejected(reason.to_owned());
+    Output::Refuse {
+        conversation,
+        reason,
+    }
+}
+
+fn deciding(policy: Policy) -> Executor {
+    let mut executor = Executor::new(ActionLimits::default());
+    let options = OfferOptions {
+        decides: true,
+        ..OfferOptions::default()
+    };
+    executor.offer(action("drive", policy), options).unwrap();
+    executor
+}
+
+#[test]
+fn a_client_learns_at_once_whether_its_goal_waits() {
+    let mut executor = with(Policy::Queue(1));
+    executor.request(0, 1, "rover", "a", goal("")).unwrap();
+    assert_eq!(told(&mut executor), [agree(1, false)]);
+    executor.request(0, 2, "rover", "b", goal("")).unwrap();
+    assert_eq!(told(&mut executor), [agree(2, true)]);
+    // A repeat learns it, too.
+    executor.request(1, 3, "rover", "b", goal("")).unwrap();
+    assert_eq!(told(&mut executor), [agree(3, true)]);
+    let first = executor.find("rover", "a").unwrap();
+    executor.accept(first);
+    assert_eq!(told(&mut executor), [], "it is accepted already");
+    executor.ended(2, first, Ok(None));
+    assert_eq!(told(&mut executor), [finish(1, Ok(None))]);
+    executor.request(3, 4, "rover", "a", goal("")).unwrap();
+    assert_eq!(told(&mut executor), [agree(4, false), finish(4, Ok(None))]);
+}
+
+#[test]
+fn a_handler_that_decides_accepts_a_goal_once_for_all_its_conversations() {
+    let mut executor = deciding(Policy::Reject);
+    executor.request(0, 1, "rover", "a", goal("")).unwrap();
+    let number = started(&mut executor);
+    executor.request(1, 2, "rover", "a", goal("")).unwrap();
+    assert_eq!(told(&mut executor), []);
+    executor.accept(number);
+    assert_eq!(told(&mut executor), [agree(1, false), agree(2, false)]);
+    executor.accept(number);
+    assert_eq!(told(&mut executor), []);
+    executor.request(2, 3, "rover", "a", goal("")).unwrap();
+    assert_eq!(told(&mut executor), [agree(3, false)]);
+    let failure = || Err(Failure::Failed("no power".to_owned()));
+    executor.ended(3, number, failure());
+    let ends = [1, 2, 3].map(|conversation| finish(conversation, failure()));
+    assert_eq!(told(&mut executor), ends);
+    executor.accept(number);
+    executor.accept(77);
+    assert_eq!(told(&mut executor), []);
+}
+
+#[test]
+fn a_goal_that_its_handler_rejects_is_refused_also_when_it_is_sent_again() {
+    let mut executor = deciding(Policy::Reject);
+    executor.request(0, 1, "rover", "a", goal("")).unwrap();
+    let number = started(&mut executor);
+    executor.request(0, 2, "rover", "a", goal("")).unwrap();
+    let reason = "out of reach";
+    executor.ended(1, number, Err(Failure::Failed(reason.to_owned())));
+    assert_eq!(told(&mut executor), [refuse(1, reason), refuse(2, reason)]);
+    let again = executor.request(2, 3, "rover", "a", goal(""));
+    assert_eq!(again, Err(Refusal::Rejected(reason.to_owned())));
+    assert_eq!(told(&mut executor), []);
+    let status = executor.status_of(2, number).unwrap();
+    assert_eq!(status.state, GoalState::Failed);
+    // A result is an acceptance.
+    executor.request(3, 4, "rover", "b", goal("")).unwrap();
+    let number = started(&mut executor);
+    executor.ended(4, number, Ok(None));
+    assert_eq!(told(&mut executor), [agree(4, false), finish(4, Ok(None))]);
+    // A reason that is too long to be stored.
+    let limits = ActionLimits {
+        bytes_of_client: 100,
+        ..ActionLimits::default()
+    };
+    let mut small = Executor::new(limits);
+    let options = OfferOptions {
+        decides: true,
+        ..OfferOptions::default()
+    };
+    small
+        .offer(action("drive", Policy::Reject), options)
+        .unwrap();
+    small.request(0, 1, "rover", "a", goal("")).unwrap();
+    let number = started(&mut small);
+    small.ended(1, number, Err(Failure::Failed(reason.to_owned())));
+    let again = small.request(2, 2, "rover", "a", goal(""));
+    assert!(matches!(again, Err(Refusal::Rejected(_))), "{again:?}");
+}
+
+#[test]
+fn a_goal_that_waits_for_a_handler_that_decides_is_accepted_when_it_runs() {
+    let mut executor = deciding(Policy::Queue(4));
+    executor.request(0, 1, "rover", "a", goal("")).unwrap();
+    let first = started(&mut executor);
+    for (conversation, id) in [(2, "b"), (3, "c"), (4, "d")] {
+        executor
+            .request(0, conversation, "rover", id, goal(""))
+            .unwrap();
+    }
+    executor.accept(first + 1);
+    executor.accept(first);
+    assert_eq!(told(&mut executor), [agree(1, false)]);
+    // One that is cancelled in the queue is refused.
+    executor.cancel(1, 3);
+    assert_eq!(told(&mut executor), [refuse(3, "cancelled by the client")]);
+    executor.ended(2, first, Ok(None));
+    assert_eq!(told(&mut executor), [finish(1, Ok(None))]);
+    executor.accept(first + 1);
+    assert_eq!(told(&mut executor), [agree(2, false)]);
+    executor.withdraw(3, "drive");
+    assert_eq!(told(&mut executor), [refuse(4, "the action was withdrawn")]);
+}
+
+#[test]
+fn a_goal_can_stop_before_its_handler_decides() {
+    for cause in [
+        Cause::Cancelled,
+        Cause::DeadlinePassed,
+        Cause::ClientGone,
+        Cause::CancelledByOperator,
+    ] {
+        let mut executor = deciding(Policy::Reject);
+        let limited = Goal {
+            deadline: Some(1_000),
+            ..goal("")
+        };
+        executor.request(0, 1, "rover", "a", limited).unwrap();
+        let goal = started(&mut executor);
+        match cause {
+            Cause::Cancelled => executor.cancel(1, 1),
+            Cause::ClientGone => executor.gone(1, 1),
+            Cause::CancelledByOperator => executor.cancel_by(1, "boss", goal),
+            _ => executor.handle_timeout(1_000),
+        }
+        assert_eq!(outputs(&mut executor), [Output::Stop { goal, cause }]);
+        let abort = executor.poll_timeout().unwrap();
+        executor.handle_timeout(abort);
+        assert_eq!(outputs(&mut executor), [Output::Abort { goal }]);
+        executor.ended(abort, goal, Err(Failure::Ended));
+        let reason = match cause {
+            Cause::Cancelled => "cancelled by the client",
+            Cause::CancelledByOperator => "cancelled by the operator boss",
+            _ => "the deadline passed",
+        };
+        let expected = match cause {
+            Cause::ClientGone => vec![],
+            _ => vec![refuse(1, reason)],
+        };
+        assert_eq!(told(&mut executor), expected, "{cause:?}");
+        assert_eq!(executor.open(), 0);
+    }
 }
 
 #[test]
@@ -509,11 +692,11 @@ fn a_client_that_repeats_its_goals_takes_no_more_conversations_than_goals() {
     }
     assert_eq!(accepted, 5);
     let other = executor.request(0, 50, "arm", "a", goal(""));
-    assert_eq!(other, Ok(false));
+    assert_eq!(other, Ok(()));
     // A conversation that ends makes room for another one.
     executor.gone(1, 0);
     let again = executor.request(1, 60, "rover", "0", goal(""));
-    assert_eq!(again, Ok(false));
+    assert_eq!(again, Ok(()));
 }
 
 /// A client with many names, ids and large values stays within the bounds, and does not evict the goals
@@ -535,7 +718,12 @@ fn hostile_goals_take_bounded_memory() {
         text.policy = Policy::Queue(1_000);
         text.parameters
             .push(ParameterDescription::of::<String>("text"));
-        executor.offer(text, OfferOptions::default()).unwrap();
+        let decides = seed % 2 == 1;
+        let options = OfferOptions {
+            decides,
+            ..OfferOptions::default()
+        };
+        executor.offer(text, options).unwrap();
         let say = |length: usize| {
             let value = Term::from("x".repeat(length));
             Goal::of(
@@ -548,6 +736,8 @@ fn hostile_goals_take_bounded_memory() {
         };
         executor.request(0, 0, "honest", "mine", say(10)).unwrap();
         let mut running = vec![started(&mut executor)];
+        // The honest client and the others get an agree or a refusal once, and an outcome after an agree.
+        let mut agreed = HashMap::from([(0, !decides)]);
         let mut now = 0;
         for step in 1..3_000_u64 {
             now += random.u64(..20);
@@ -556,14 +746,26 @@ fn hostile_goals_take_bounded_memory() {
                 0..=2 => {
                     let id = random.u16(..).to_string();
                     let goal = say(random.usize(..4_000));
-                    let _ = executor.request(now, step, &client, &id, goal);
+                    if executor.request(now, step, &client, &id, goal).is_ok() {
+                        agreed.insert(step, false);
+                    }
                 }
                 3 => executor.cancel(now, random.u64(1..=step)),
                 4 => executor.gone(now, random.u64(1..=step)),
+                _ if random.u8(..4) == 0 => {
+                    if let Some(&goal) = running.last() {
+                        executor.accept(goal);
+                    }
+                }
                 _ => {
                     if let Some(goal) = running.pop() {
                         let value = Term::from("y".repeat(random.usize(..9_000)));
-                        executor.ended(now, goal, Ok(Some(value)));
+                        let fails = random.u8(..3) == 0;
+                        let failure = Failure::Failed("no power".to_owned());
+                        let outcome = if fails { Err(failure) } else { Ok(Some(value)) };
+                        // The honest goal ends first.
+                        let outcome = if goal == 1 { Ok(None) } else { outcome };
+                        executor.ended(now, goal, outcome);
                     }
                 }
             }
@@ -574,6 +776,17 @@ fn hostile_goals_take_bounded_memory() {
                     Output::Abort { goal } => {
                         executor.ended(now, goal, Err(Failure::Ended));
                         running.retain(|it| *it != goal);
+                    }
+                    Output::Agree { conversation, .. } => {
+                        let before = agreed.insert(conversation, true);
+                        assert_eq!(before, Some(false), "seed {seed}");
+                    }
+                    Output::Refuse { conversation, .. } => {
+                        assert!(decides, "seed {seed}");
+                        assert_eq!(agreed.remove(&conversation), Some(false), "seed {seed}");
+                    }
+                    Output::Finish { conversation, .. } => {
+                        assert_eq!(agreed.remove(&conversation), Some(true), "seed {seed}");
                     }
                     _ => {}
                 }

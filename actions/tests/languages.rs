@@ -63,6 +63,8 @@ fn refusals() -> Vec<Refusal> {
         Refusal::QueueFull(text()),
         Refusal::TooManyGoals,
         Refusal::UsedId(text()),
+        Refusal::Rejected(text()),
+        Refusal::Rejected(String::new()),
     ]
 }
 

@@ -1,7 +1,8 @@
 //! Goals of malicious clients and of an honest one, in random bytes of both content languages.
 //!
 //! * An admitted goal has arguments of the described types and ranges.
-//! * Each admitted goal starts at most once, and each of its conversations gets at most one outcome.
+//! * Each admitted goal starts at most once. Each of its conversations gets either at most one refusal, or an agree and
+//!   then at most one outcome.
 //! * The goals and their bytes stay within their bounds.
 //! * The goal of the honest client is not changed by others, also not by cancels.
 
@@ -31,6 +32,14 @@ const ACTS: [&str; 9] = [
     "(cancel-goals :action hold)",
 ];
 
+/// What a conversation was told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Told {
+    Nothing,
+    Agreed,
+    Ended,
+}
+
 fn offered() -> [(ActionDescription, OfferOptions); 3] {
     let mut drive = ActionDescription::new("drive");
     drive.policy = Policy::Preempt;
@@ -43,6 +52,7 @@ fn offered() -> [(ActionDescription, OfferOptions); 3] {
     let fenced = OfferOptions {
         gate: Some(Box::new(|fence| fence.starts_with('1'))),
         orphans: Orphans::Continue,
+        decides: true,
         ..OfferOptions::default()
     };
     let several = OfferOptions {
@@ -94,7 +104,7 @@ pub fn play(bytes: &[u8]) {
         .expect("a goal");
     let (mut now, mut conversation) = (0_u64, 0_u64);
     let mut running = Vec::new();
-    let mut open: HashMap<u64, bool> = HashMap::from([(0, false)]);
+    let mut open = HashMap::from([(0, Told::Nothing)]);
     let mut started = HashSet::new();
     loop {
         executor.handle_timeout(now);
@@ -122,9 +132,17 @@ pub fn play(bytes: &[u8]) {
                     executor.ended(now, goal, Err(Failure::Ended));
                     running.retain(|it| *it != goal);
                 }
+                Output::Agree { conversation, .. } => {
+                    let before = open.insert(conversation, Told::Agreed);
+                    assert_eq!(before, Some(Told::Nothing));
+                }
+                Output::Refuse { conversation, .. } => {
+                    let before = open.insert(conversation, Told::Ended);
+                    assert_eq!(before, Some(Told::Nothing));
+                }
                 Output::Finish { conversation, .. } => {
-                    let ended = open.get_mut(&conversation).expect("a conversation");
-                    assert!(!std::mem::replace(ended, true), "two outcomes");
+                    let before = open.insert(conversation, Told::Ended);
+                    assert_eq!(before, Some(Told::Agreed));
                 }
                 _ => {}
             }
@@ -159,6 +177,9 @@ pub fn play(bytes: &[u8]) {
             }
             5 => {
                 if let Some(goal) = running.last() {
+                    if input.below(2) == 0 {
+                        executor.accept(*goal);
+                    }
                     let part = f64::from_bits(input.u64());
                     executor.progress(now, *goal, Progress::fraction(part));
                 }
@@ -186,13 +207,14 @@ pub fn play(bytes: &[u8]) {
                 };
                 conversation += 1;
                 let id = goal.id.clone().unwrap_or_else(|| conversation.to_string());
-                open.insert(conversation, false);
-                if executor
-                    .request(now, conversation, client, &id, goal)
-                    .is_err()
-                {
-                    open.insert(conversation, true);
-                }
+                let requested = executor.request(now, conversation, client, &id, goal);
+                open.insert(
+                    conversation,
+                    match requested {
+                        Ok(()) => Told::Nothing,
+                        Err(_) => Told::Ended,
+                    },
+                );
             }
         }
     }

@@ -217,11 +217,23 @@ impl<'a> Robot<'a> {
     }
 
     /// Sends a goal like [`invoke`](Self::invoke), with its deadline, fence and id. A goal that was sent
-    /// before, under the same id, does not run again: the handle gets its outcome.
+    /// before, under the same id, does not run again: the handle gets its outcome. The wait goes on while the robot
+    /// reports that it has the goal and has not decided.
     ///
     /// # Errors
     /// See [`invoke`](Self::invoke).
-    pub async fn send(&self, mut goal: Goal) -> Result<GoalHandle<'a>, ActionError> {
+    pub async fn send(&self, goal: Goal) -> Result<GoalHandle<'a>, ActionError> {
+        let mut handle = self.propose(goal).await?;
+        handle.accepted().await?;
+        Ok(handle)
+    }
+
+    /// Sends a goal like [`send`](Self::send), and does not wait until the robot accepts it. The goal can be cancelled
+    /// meanwhile.
+    ///
+    /// # Errors
+    /// If the goal has no notation, or cannot be sent.
+    pub async fn propose(&self, mut goal: Goal) -> Result<GoalHandle<'a>, ActionError> {
         goal.id.get_or_insert_with(|| self.agent.unique_id());
         let ask = Ask::Goal(goal.clone());
         let message = self.message(Performative::Request, &ask)?;
@@ -230,16 +242,11 @@ impl<'a> Robot<'a> {
         let request = self
             .agent
             .request(message, timeout.unwrap_or(Duration::MAX));
-        let mut request = request.await?;
-        match tokio::time::timeout(self.timeout(), request.agreed()).await {
-            Ok(agreed) => agreed?,
-            Err(_) => return Err(ActionError::Dialogue(DialogueError::TimedOut)),
-        };
         Ok(GoalHandle {
             robot: self.clone(),
             goal,
             ask,
-            request,
+            request: request.await?,
             earlier: Vec::new(),
         })
     }
@@ -273,7 +280,7 @@ fn read(
     answer.map_err(ActionError::Answer)
 }
 
-/// A goal that the robot has accepted; see [`Robot::invoke`]. Dropping it does not cancel the goal; the
+/// A goal that was sent to a robot; see [`Robot::invoke`]. Dropping it does not cancel the goal; the
 /// further messages go to [`Agent::receive`].
 #[must_use = "result() returns the result"]
 pub struct GoalHandle<'a> {
@@ -302,6 +309,26 @@ impl GoalHandle<'_> {
     #[must_use]
     pub fn reachability(&self) -> Reachability {
         self.request.reachability()
+    }
+
+    /// Waits until the robot accepts the goal. Dropping the future loses nothing.
+    ///
+    /// # Errors
+    /// If the robot refuses ([`ActionError::Refused`]), is gone, or neither answers in time nor reports that it has the
+    /// goal.
+    pub async fn accepted(&mut self) -> Result<(), ActionError> {
+        let goal = GoalRef::from(self.id());
+        loop {
+            let agreed = self.request.agreed();
+            if let Ok(agreed) = tokio::time::timeout(self.robot.timeout(), agreed).await {
+                agreed?;
+                return Ok(());
+            }
+            let status = self.robot.status_of(goal.clone()).await;
+            if !status.is_ok_and(|status| !status.state.is_over()) {
+                return Err(ActionError::Dialogue(DialogueError::TimedOut));
+            }
+        }
     }
 
     /// Subscribes to the progress of the goal. The handle can be used meanwhile.

@@ -96,6 +96,32 @@ impl Action {
         self
     }
 
+    /// Lets the handler decide about each goal. The client gets the `agree` when the handler calls
+    /// [`Execution::accept`](super::Execution::accept), or returns a result. If the handler returns an error before, the
+    /// goal is refused with that reason ([`Refusal::Rejected`](super::Refusal::Rejected)). A goal that waits in a queue
+    /// gets its `agree` when the handler accepts it.
+    ///
+    /// ```no_run
+    /// use fipa::actions::{Action, Execution};
+    ///
+    /// # fn example(arm: &fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
+    /// let reach = Action::new("reach").parameter::<f64>("distance", "m").decided_by_handler();
+    /// let offer = arm.offer(reach, |goal: std::collections::BTreeMap<String, f64>, run: Execution| async move {
+    ///     if goal.values().any(|distance| *distance > 0.8) {
+    ///         return Err("out of reach");
+    ///     }
+    ///     run.accept();
+    ///     // The movement.
+    ///     Ok(())
+    /// })?;
+    /// # Ok(())
+    /// # }
+    /// ```
+    pub fn decided_by_handler(mut self) -> Self {
+        self.options.decides = true;
+        self
+    }
+
     /// Requires the fence of a lock, and checks it: when the goal arrives, and again when it starts after
     /// a wait. The check must not wait. It gets the text of the fence.
     pub fn fenced(mut self, admits: impl FnMut(&str) -> bool + Send + 'static) -> Self {

@@ -10,7 +10,7 @@ use fipa_actions::{
 };
 
 use crate::access::gate::RulesGate;
-use crate::actions::table::{ActionTable, Asking};
+use crate::actions::table::{ActionTable, Asking, Told};
 use crate::agent::AgentCore;
 use crate::protocol::{DialogueError, Reply, Task, serve_those};
 
@@ -139,27 +139,33 @@ impl Side {
             id: Some(id.clone()),
             ..Goal::of(goal.action.clone(), Vec::new())
         });
-        let mut accepted = match self.table.request(&self.client, &id, goal) {
-            Ok(accepted) => accepted,
+        let mut admitted = match self.table.request(&self.client, &id, goal) {
+            Ok(admitted) => admitted,
             Err(reason) => return self.refuse(&reference, reason),
         };
-        let queued = accepted.queued;
-        let agreed = task
-            .agree(self.write(&reference, &ActionAnswer::Agreed { queued }))
-            .await;
-        if agreed.is_err() {
-            // Dropping the conversation cancels the goal: its client is gone.
-            return Reply::Nothing;
-        }
-        let mut cancelled = false;
+        let agreed = |queued| self.write(&reference, &ActionAnswer::Agreed { queued });
+        let (mut cancelled, mut late_agree) = (false, None);
         let outcome = loop {
+            // Returning drops the conversation, which cancels the goal: its client is gone.
             tokio::select! {
                 biased;
-                outcome = &mut accepted.outcome => break outcome.unwrap_or(Err(Failure::Withdrawn)),
+                told = admitted.told.recv() => match told {
+                    // The answer to the cancel comes first.
+                    Some(Told::Agreed { queued }) if cancelled => late_agree = Some(queued),
+                    Some(Told::Agreed { queued }) => {
+                        if task.agree(agreed(queued)).await.is_err() {
+                            return Reply::Nothing;
+                        }
+                    }
+                    Some(Told::Refused(reason)) if !cancelled => return self.refuse(&reference, reason),
+                    Some(Told::Refused(_)) => return task.confirm_cancel().await.unwrap_or(Reply::Nothing),
+                    Some(Told::Ended(outcome)) => break outcome,
+                    None => break Err(Failure::Withdrawn),
+                },
                 received = task.cancelled() => match received {
                     Ok(()) => {
                         cancelled = true;
-                        accepted.conversation.cancel();
+                        admitted.conversation.cancel();
                     }
                     // A mistake of the client does not end its goal.
                     Err(error) if is_mistake(&error) => {}
@@ -179,6 +185,11 @@ impl Side {
                         .fail_cancel(self.write(&reference, &too_late))
                         .await
                         .is_err()
+                {
+                    return Reply::Nothing;
+                }
+                if let Some(queued) = late_agree
+                    && task.agree(agreed(queued)).await.is_err()
                 {
                     return Reply::Nothing;
                 }

@@ -17,7 +17,7 @@ use fipa_actions::{
 use fipa_content::Term;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
-use tokio::sync::{Notify, oneshot, watch};
+use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::AbortHandle;
 
 /// Maximum number of subscriptions of one client.
@@ -25,6 +25,19 @@ const MAX_SUBSCRIPTIONS: usize = 256;
 
 /// The result of a goal.
 pub(crate) type Outcome = Result<Option<Term<'static>>, Failure>;
+
+/// What a client is told about its goal.
+pub(crate) enum Told {
+    /// The goal is accepted.
+    Agreed {
+        /// Whether the goal waits in the queue.
+        queued: bool,
+    },
+    /// The goal is refused. The last event.
+    Refused(Refusal),
+    /// The goal has ended. The last event.
+    Ended(Outcome),
+}
 
 /// Runs a goal.
 pub(crate) type Handler =
@@ -46,8 +59,8 @@ struct State {
     executor: Executor,
     handlers: HashMap<String, Handler>,
     tasks: HashMap<u64, Task>,
-    /// Receivers of the outcomes, by conversation.
-    conversations: HashMap<u64, oneshot::Sender<Outcome>>,
+    /// Receivers of the decisions and outcomes, by conversation.
+    conversations: HashMap<u64, mpsc::UnboundedSender<Told>>,
     conversation: u64,
     /// The goals whose status clients watch.
     watched: HashMap<u64, watch::Sender<GoalStatus>>,
@@ -104,10 +117,9 @@ pub(crate) struct Asking<'a> {
 }
 
 /// A goal that a client has sent.
-pub(crate) struct Accepted {
-    /// Whether the goal waits in the queue.
-    pub(crate) queued: bool,
-    pub(crate) outcome: oneshot::Receiver<Outcome>,
+pub(crate) struct Admitted {
+    /// Gets at most two events.
+    pub(crate) told: mpsc::UnboundedReceiver<Told>,
     pub(crate) conversation: Conversation,
 }
 
@@ -292,8 +304,8 @@ impl ActionTable {
     }
 
     /// Handles a goal.
-    pub(crate) fn request(&self, client: &str, id: &str, goal: Goal) -> Result<Accepted, Refusal> {
-        let (sender, outcome) = oneshot::channel();
+    pub(crate) fn request(&self, client: &str, id: &str, goal: Goal) -> Result<Admitted, Refusal> {
+        let (sender, told) = mpsc::unbounded_channel();
         let number = {
             let mut state = self.0.state.lock();
             state.conversation += 1;
@@ -304,9 +316,8 @@ impl ActionTable {
         let requested =
             self.change(|executor, now| executor.request(now, number, client, id, goal));
         match requested {
-            Ok(queued) => Ok(Accepted {
-                queued,
-                outcome,
+            Ok(()) => Ok(Admitted {
+                told,
                 conversation: Conversation {
                     table: self.clone(),
                     number,
@@ -349,15 +360,23 @@ impl ActionTable {
                         abort.abort();
                     }
                 }
+                Output::Agree {
+                    conversation,
+                    queued,
+                } => {
+                    if let Some(waiting) = state.conversations.get(&conversation) {
+                        // The conversation may have ended.
+                        let _ = waiting.send(Told::Agreed { queued });
+                    }
+                }
+                Output::Refuse {
+                    conversation,
+                    reason,
+                } => state.tell_last(conversation, Told::Refused(reason)),
                 Output::Finish {
                     conversation,
                     outcome,
-                } => {
-                    if let Some(waiting) = state.conversations.remove(&conversation) {
-                        // The conversation may have ended.
-                        let _ = waiting.send(outcome);
-                    }
-                }
+                } => state.tell_last(conversation, Told::Ended(outcome)),
                 Output::Changed { goal } => {
                     state
                         .changes
@@ -413,6 +432,14 @@ impl ActionTable {
 }
 
 impl State {
+    /// Tells the client of a conversation the last event.
+    fn tell_last(&mut self, conversation: u64, last: Told) {
+        if let Some(waiting) = self.conversations.remove(&conversation) {
+            // The conversation may have ended.
+            let _ = waiting.send(last);
+        }
+    }
+
     /// Returns a receiver of the status of the goal with this number.
     fn watch(&mut self, goal: u64) -> Option<watch::Receiver<GoalStatus>> {
         let status = self.executor.status_of(self.now(), goal)?;
@@ -487,6 +514,13 @@ impl Execution {
     #[must_use]
     pub fn deadline(&self) -> Option<Instant> {
         self.deadline
+    }
+
+    /// Accepts the goal, if the handler decides ([`Action::decided_by_handler`](super::Action::decided_by_handler)):
+    /// the client gets the `agree`. Without effect on a goal that is accepted already.
+    pub fn accept(&self) {
+        let goal = self.goal;
+        self.table.change(|executor, _| executor.accept(goal));
     }
 
     /// Reports progress. Clients get at most ten reports of a goal per second, and always the last one.

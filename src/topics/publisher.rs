@@ -604,6 +604,10 @@ async fn serve(
     // received the `agree`.
     let (name, is_remote) = (name_of(first), is_remote(core, first));
     let (number, added) = registered.register(name, is_remote, asked.unwrap_or(Keep::All));
+    let kind = Kind {
+        language: registered.topic.language.clone(),
+        ontology: registered.topic.ontology.clone(),
+    };
     drop(registered);
     let agree = core.endpoint.reply(first, Performative::Agree).content("");
     let agree = match asked {
@@ -618,7 +622,8 @@ async fn serve(
                 is_remote,
                 round_trip: begun.elapsed(),
             };
-            notify(&mut dialogue, first, shared, number, &added, distance).await
+            let subscriber = (number, &*added);
+            notify(&mut dialogue, first, shared, subscriber, &kind, distance).await
         }
         Err(error) => Err(error),
     };
@@ -630,6 +635,12 @@ async fn serve(
 
 /// The content of the `failure`, or of the `refuse`, at the end of a publisher.
 const ENDED: &str = "the publisher has ended";
+
+/// The kind of the contents, which each notification names.
+struct Kind {
+    language: Option<String>,
+    ontology: Option<String>,
+}
 
 /// The way to a subscriber.
 #[derive(Debug, Clone, Copy)]
@@ -669,8 +680,8 @@ async fn notify(
     dialogue: &mut Dialogue,
     first: &Message,
     shared: &Weak<Shared>,
-    number: u64,
-    added: &Notify,
+    (number, added): (u64, &Notify),
+    kind: &Kind,
     mut distance: Distance,
 ) -> Result<(), DialogueError> {
     let mut under_way: VecDeque<UnderWay> = VecDeque::new();
@@ -728,7 +739,7 @@ async fn notify(
                     has_ended = true;
                     continue;
                 };
-                under_way.push_back(send(dialogue, first, waiting, keep)?);
+                under_way.push_back(send(dialogue, first, waiting, kind, keep)?);
             }
         }
     }
@@ -762,10 +773,17 @@ fn send(
     dialogue: &mut Dialogue,
     first: &Message,
     waiting: Waiting,
+    kind: &Kind,
     keep: Keep,
 ) -> Result<UnderWay, DialogueError> {
     let Waiting { sample, result } = waiting;
-    let notification = dialogue.agent().endpoint.reply(first, Performative::Inform);
+    let mut notification = dialogue.agent().endpoint.reply(first, Performative::Inform);
+    if let Some(language) = &kind.language {
+        notification = notification.language(language);
+    }
+    if let Some(ontology) = &kind.ontology {
+        notification = notification.ontology(ontology);
+    }
     let notification = notification.content(sample.content);
     let notification = marked(notification, sample.number, sample.published, keep);
     // With a short deadline, each end of it would leave one more outdated content in the queue of a subscriber that

@@ -17,6 +17,10 @@ pub struct Topic {
     name: String,
     /// The media type of the contents, if it is known.
     pub(super) media_type: Option<String>,
+    /// The content language of the notifications.
+    pub(super) language: Option<String>,
+    /// The ontology of the notifications.
+    pub(super) ontology: Option<String>,
     /// Notifications per second, if they are known.
     pub(super) rate: Option<f64>,
     /// Number of contents that are kept for new subscribers.
@@ -34,6 +38,8 @@ impl Topic {
         Self {
             name: name.into(),
             media_type: None,
+            language: None,
+            ontology: None,
             rate: None,
             latched: 0,
             wait: WAIT,
@@ -45,6 +51,20 @@ impl Topic {
     #[must_use]
     pub fn media_type(mut self, media_type: impl Into<String>) -> Self {
         self.media_type = Some(media_type.into());
+        self
+    }
+
+    /// Sets the content language, which each notification carries (`:language`), for example `json`.
+    #[must_use]
+    pub fn language(mut self, language: impl Into<String>) -> Self {
+        self.language = Some(language.into());
+        self
+    }
+
+    /// Sets the ontology, which each notification carries (`:ontology`), for example the name of the type of its content.
+    #[must_use]
+    pub fn ontology(mut self, ontology: impl Into<String>) -> Self {
+        self.ontology = Some(ontology.into());
         self
     }
 

@@ -9,6 +9,7 @@ mod process;
 #[path = "../support/mod.rs"]
 mod support;
 
+use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -423,6 +424,118 @@ async fn deadlines_policies_and_withdrawals_end_goals() {
     assert!(matches!(failed, Err(ActionError::Failed(failure)) if failure == power));
     let undescribed = robot.offer(Action::new("turn"), |_: Dock, run| forever(run));
     assert!(matches!(undescribed, Err(OfferError::Undescribed(name)) if name == "target"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_handler_that_decides_accepts_or_rejects_goals() {
+    let (here, there) = two(&patient()).await;
+    let robot = here.register("crex").await.unwrap();
+    let go = Arc::new(Semaphore::new(0));
+    let (gate, asked) = (Arc::clone(&go), Arc::new(Semaphore::new(0)));
+    let asks = Arc::clone(&asked);
+    let reach = Action::new("reach").parameter::<f64>("distance", "m");
+    let _offers = (
+        robot
+            .offer(
+                reach.decided_by_handler(),
+                move |goal: BTreeMap<String, f64>, run: Execution| {
+                    let (gate, asks) = (Arc::clone(&gate), Arc::clone(&asks));
+                    async move {
+                        asks.add_permits(1);
+                        if goal["distance"] > 0.8 {
+                            return Err("out of reach");
+                        }
+                        gate.acquire().await.unwrap().forget();
+                        run.accept();
+                        gate.acquire().await.unwrap().forget();
+                        Ok(goal["distance"])
+                    }
+                },
+            )
+            .unwrap(),
+        robot
+            .offer(
+                Action::new("look").decided_by_handler(),
+                |(): (), _: Execution| async { Ok::<_, String>("a crate") },
+            )
+            .unwrap(),
+        robot
+            .offer(
+                Action::new("jump").decided_by_handler(),
+                |(): (), run: Execution| async move {
+                    run.stopped().await;
+                    Ok::<_, String>(2)
+                },
+            )
+            .unwrap(),
+    );
+    let rover = there.register("rover").await.unwrap();
+    let crex = rover.robot(crex());
+    let reach = |distance: f64| {
+        let arguments = BTreeMap::from([("distance", distance)]);
+        crex.goal("reach", &arguments).unwrap()
+    };
+    for crex in [crex.clone(), crex.clone().in_json()] {
+        let far = reach(0.9);
+        for _ in 0..2 {
+            let refused = crex.send(far.clone()).await;
+            let Err(ActionError::Refused(Refusal::Rejected(reason))) = refused else {
+                panic!("{refused:?}");
+            };
+            assert_eq!(reason, "out of reach");
+        }
+        asked.acquire().await.unwrap().forget();
+        // The client waits until the handler accepts.
+        let mut near = crex.propose(reach(0.5)).await.unwrap();
+        asked.acquire().await.unwrap().forget();
+        let early = tokio::time::timeout(Duration::from_millis(50), near.accepted());
+        assert!(early.await.is_err());
+        go.add_permits(1);
+        near.accepted().await.unwrap();
+        go.add_permits(1);
+        assert_eq!(near.result::<f64>().await.unwrap(), 0.5);
+        // A result accepts the goal.
+        let look = crex.invoke("look", &()).await.unwrap();
+        assert_eq!(look.result::<String>().await.unwrap(), "a crate");
+    }
+    // A cancel comes before the decision.
+    let mut near = crex.propose(reach(0.6)).await.unwrap();
+    asked.acquire().await.unwrap().forget();
+    assert!(near.cancel(TIMEOUT).await.unwrap());
+    let status = crex.status_of(near.id()).await.unwrap();
+    assert_eq!(status.state, GoalState::Failed);
+    let mut jump = crex.propose(crex.goal("jump", &()).unwrap()).await.unwrap();
+    assert!(!jump.cancel(TIMEOUT).await.unwrap(), "it is done");
+    jump.accepted().await.unwrap();
+    assert_eq!(jump.result::<i64>().await.unwrap(), 2);
+    // The time of the goal is over.
+    let limited = Goal {
+        deadline: Some(50),
+        ..reach(0.6)
+    };
+    let late = crex.send(limited).await;
+    let Err(ActionError::Refused(Refusal::Rejected(reason))) = late else {
+        panic!("{late:?}");
+    };
+    assert_eq!(reason, "the deadline passed");
+}
+
+/// The time for an answer is shorter than the decision. The robot reports that it has the goal.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_waits_for_a_late_decision() {
+    let (here, there) = two(&config(&["mts.deadline=1s"])).await;
+    let robot = here.register("crex").await.unwrap();
+    let slow = Action::new("plan").decided_by_handler();
+    let _offer = robot
+        .offer(slow, |(): (), run: Execution| async move {
+            tokio::time::sleep(Duration::from_secs(3)).await;
+            run.accept();
+            Ok::<_, String>(())
+        })
+        .unwrap();
+    let rover = there.register("rover").await.unwrap();
+    let plan = rover.robot(crex()).invoke("plan", &()).await.unwrap();
+    plan.result::<()>().await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]

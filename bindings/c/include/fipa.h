@@ -583,7 +583,10 @@ struct fipa_text fipa_error(void);
 /*
  Offers an action. `description` is a JSON object with a `name` and, as far as they are needed, `description`,
  `parameters` (each with `name`, `type` such as `number`, and `unit`, `range`, `default`, `description`,
- `optional`), `result` (a type), and `policy` (`reject`, `preempt`, or `{"queue": N}`). Each goal is an item of the
+ `optional`), `result` (a type), and `policy` (`reject`, `preempt`, or `{"queue": N}`). `concurrency` is the maximum
+ number of goals that run at the same time, by default 1; `client_gone` is `cancel`, the default, or `continue`, for a
+ goal whose client is gone; `fenced_by` is an object with `owner` and `resource`, the lock whose fence each goal needs;
+ with `decides`, `true`, the client learns that its goal is accepted by `fipa_goal_accept`. Each goal is an item of the
  kind `FIPA_EVENT_GOAL`. Closing the offer withdraws the action and cancels its goals.
 
  # Safety
@@ -593,6 +596,11 @@ fipa_result fipa_offer(fipa_handle agent,
                        struct fipa_text description,
                        uint64_t tag,
                        fipa_handle *offer);
+
+/*
+ Accepts a goal of an action with `decides`. Without effect on other goals, and on one that is accepted already.
+ */
+fipa_result fipa_goal_accept(fipa_handle goal);
 
 /*
  Reports the progress of a goal: a JSON object with `fraction` from 0 to 1, `note` and `value`, each optional.
@@ -605,7 +613,7 @@ fipa_result fipa_goal_progress(fipa_handle goal,
 
 /*
  Ends a goal: with its result, a value in JSON or an empty text, if `is_done` is not 0; else with a failure, whose
- reason is the text. The caller closes the handle afterwards. A goal that is closed without an end fails.
+ reason is the text; a goal of an action with `decides` that was not accepted is refused with it. The caller closes the handle afterwards. A goal that is closed without an end fails.
 
  # Safety
  The text must be readable.

@@ -34,7 +34,10 @@ impl Object for OpenGoal {
 
 /// Offers an action. `description` is a JSON object with a `name` and, as far as they are needed, `description`,
 /// `parameters` (each with `name`, `type` such as `number`, and `unit`, `range`, `default`, `description`,
-/// `optional`), `result` (a type), and `policy` (`reject`, `preempt`, or `{"queue": N}`). Each goal is an item of the
+/// `optional`), `result` (a type), and `policy` (`reject`, `preempt`, or `{"queue": N}`). `concurrency` is the maximum
+/// number of goals that run at the same time, by default 1; `client_gone` is `cancel`, the default, or `continue`, for a
+/// goal whose client is gone; `fenced_by` is an object with `owner` and `resource`, the lock whose fence each goal needs;
+/// with `decides`, `true`, the client learns that its goal is accepted by `fipa_goal_accept`. Each goal is an item of the
 /// kind `FIPA_EVENT_GOAL`. Closing the offer withdraws the action and cancels its goals.
 ///
 /// # Safety
@@ -80,6 +83,15 @@ fn offered_event(event: Offered, handle: &GivenHandle) -> Event {
     }
 }
 
+/// Accepts a goal of an action with `decides`. Without effect on other goals, and on one that is accepted already.
+#[unsafe(no_mangle)]
+pub extern "C" fn fipa_goal_accept(goal: FipaHandle) -> FipaResult {
+    call(|| {
+        table::get::<OpenGoal>(goal)?.pursuit.accept();
+        Ok(FipaResult::Ok)
+    })
+}
+
 /// Reports the progress of a goal: a JSON object with `fraction` from 0 to 1, `note` and `value`, each optional.
 ///
 /// # Safety
@@ -96,7 +108,7 @@ pub unsafe extern "C" fn fipa_goal_progress(goal: FipaHandle, progress: FipaText
 }
 
 /// Ends a goal: with its result, a value in JSON or an empty text, if `is_done` is not 0; else with a failure, whose
-/// reason is the text. The caller closes the handle afterwards. A goal that is closed without an end fails.
+/// reason is the text; a goal of an action with `decides` that was not accepted is refused with it. The caller closes the handle afterwards. A goal that is closed without an end fails.
 ///
 /// # Safety
 /// The text must be readable.

@@ -864,6 +864,9 @@ class goal : public detail::handle<goal> {
   [[nodiscard]] std::string_view arguments() const& noexcept { return detail::read_text(raw()); }
   /// A text of a temporary object would be invalid at once.
   std::string_view arguments() const&& = delete;
+  /// Accepts the goal of an action with `decides`. Without effect on other goals, and on one that is
+  /// accepted already.
+  result<void> accept() const { return detail::checked(fipa_goal_accept(raw())); }
   /// Reports the progress: a JSON object with `fraction`, `note` and `value`, each optional.
   result<void> progress(std::string_view json) const {
     return detail::checked(fipa_goal_progress(raw(), detail::text(json)));
@@ -872,7 +875,7 @@ class goal : public detail::handle<goal> {
   result<void> succeed(std::string_view json = {}) const {
     return detail::checked(fipa_goal_end(raw(), 1, detail::text(json)));
   }
-  /// Ends the goal with a failure.
+  /// Ends the goal with a failure. A goal of an action with `decides` that was not accepted is refused.
   result<void> fail(std::string_view reason) const {
     return detail::checked(fipa_goal_end(raw(), 0, detail::text(reason)));
   }

@@ -519,6 +519,24 @@ static void actions(const fipa::domain& domain, const fipa::agent& rover, const 
     is_ended = item->kind() == event::ended;
     CHECK(!is_ended || (item->tag() == 74 && !item->succeeded()));
   }
+
+  const auto deciding = take(arm.offer(R"({"name": "grip", "decides": true})", 75));
+  going = take(rover.begin_goal("arm", "grip", {}, 76));
+  goal = take(next(domain, 75, event::goal).take_goal());
+  CHECK(goal.accept());
+  CHECK(next(domain, 76, event::accepted).succeeded());
+  CHECK(goal.succeed());
+  is_ended = false;
+  while (!is_ended) {
+    const auto item = take(domain.next(step));
+    CHECK(item && item->tag() == 76 && item->succeeded());
+    is_ended = item->kind() == event::result;
+  }
+  going = take(rover.begin_goal("arm", "grip", {}, 77));
+  goal = take(next(domain, 75, event::goal).take_goal());
+  CHECK(goal.fail("no power"));
+  const auto refused = next(domain, 77, event::ended);
+  CHECK(refused.error().code() == errc::refused && has(refused.error().text(), "no power"));
 }
 
 static void topics(const fipa::domain& domain, const fipa::agent& rover, const fipa::agent& arm) {

@@ -40,7 +40,11 @@ fn value(value: Value) -> Output {
 impl Agent {
     /// Offers an action: each goal of a client is a `Goal`. `description` is a dictionary with a `name` and, as far as
     /// they are needed, `description`, `parameters`, `result` (a type) and `policy` (`"reject"`, `"preempt"`, or
-    /// `{"queue": N}`). The end of the sequence withdraws the action.
+    /// `{"queue": N}`). `concurrency` is the maximum number of goals that run at the same time, by default 1.
+    /// `client_gone` is `"cancel"`, the default, or `"continue"`: what happens to a goal whose client is gone.
+    /// `fenced_by` is a dictionary with `owner` and `resource`: each goal needs the fence of that lock. With
+    /// `decides`, `True`, the client learns that its goal is accepted when the program calls `Goal.accept`. The end of
+    /// the sequence withdraws the action.
     fn goals(&self, description: &Bound<'_, PyAny>) -> PyResult<Events> {
         let py = description.py();
         let agent = self.registered(py)?;
@@ -140,12 +144,15 @@ impl Agent {
                 .flatten();
         }
         let cancel = Arc::<Notify>::default();
+        let accepted = watch::Sender::new(false);
         let events = invoke(agent, robot, goal, Arc::clone(&cancel));
         Ok(RemoteGoal {
             led: Arc::new(Mutex::new(Led {
                 events: begun(events),
-                result: None,
+                accepted: accepted.clone(),
+                end: None,
             })),
+            accepted,
             cancel,
         })
     }
@@ -170,6 +177,23 @@ impl Goal {
         self.arguments.clone_ref(py)
     }
 
+    /// The id that the client gave the goal.
+    #[getter]
+    fn id(&self) -> &str {
+        self.pursuit.id()
+    }
+
+    /// The name of the client.
+    #[getter]
+    fn client(&self) -> Option<&str> {
+        self.pursuit.client()
+    }
+
+    /// Accepts the goal of an action with `decides`. Without effect on other goals, and on one that is accepted already.
+    fn accept(&self) {
+        self.pursuit.accept();
+    }
+
     /// Reports the progress: the done part from 0 to 1, the present step in words, and a value of the action.
     #[pyo3(signature = (fraction=None, note=None, value=None))]
     fn progress(
@@ -192,14 +216,15 @@ impl Goal {
         self.pursuit.progress(report).or_raise(py)
     }
 
-    /// Ends the goal with its result.
+    /// Ends the goal with its result. It is accepted, if it was not.
     #[pyo3(signature = (result=None))]
     fn succeed(&self, py: Python<'_>, result: Option<&Bound<'_, PyAny>>) -> PyResult<()> {
         let result = result.map(|result| from_python(result, "the result"));
         self.pursuit.end(Ok(result.transpose()?)).or_raise(py)
     }
 
-    /// Ends the goal with a failure.
+    /// Ends the goal with a failure. A goal of an action with `decides` that was not accepted is refused with this
+    /// reason.
     #[pyo3(signature = (reason=""))]
     fn fail(&self, py: Python<'_>, reason: &str) -> PyResult<()> {
         self.pursuit.end(Err(reason.to_owned())).or_raise(py)
@@ -234,29 +259,55 @@ impl std::fmt::Debug for Goal {
 #[pyclass(frozen, module = "fipa")]
 pub(crate) struct RemoteGoal {
     led: Arc<Mutex<Led>>,
+    accepted: watch::Sender<bool>,
     cancel: Arc<Notify>,
 }
 
 struct Led {
     events: BoxStream<'static, Result<GoalEvent, Failure>>,
-    result: Option<Value>,
+    /// Whether the robot has accepted the goal.
+    accepted: watch::Sender<bool>,
+    /// The result, or the failure.
+    end: Option<Result<Value, Failure>>,
 }
 
 impl Led {
-    /// Waits for the next event. Keeps the result.
+    /// Waits for the next progress. Keeps the end.
     async fn next(&mut self) -> Result<Option<Value>, Failure> {
         loop {
-            if self.result.is_some() {
-                return Ok(None);
+            match &self.end {
+                Some(Ok(_)) => return Ok(None),
+                Some(Err(failure)) => return Err(failure.clone()),
+                None => {}
             }
-            match self.events.next().await {
-                Some(Ok(GoalEvent::Accepted)) => {}
-                Some(Ok(GoalEvent::Progress(progress))) => return Ok(Some(progress)),
-                Some(Ok(GoalEvent::Result(result))) => self.result = Some(result),
-                Some(Err(failure)) => return Err(failure),
-                None => return Err(Failure::new(FailureKind::Closed, "the goal has ended")),
+            if let Some(progress) = self.event().await {
+                return Ok(Some(progress));
             }
         }
+    }
+
+    /// Waits until the robot accepts the goal. No progress comes before.
+    async fn accepted(&mut self) -> Result<(), Failure> {
+        while !*self.accepted.borrow() {
+            if let Some(Err(failure)) = &self.end {
+                return Err(failure.clone());
+            }
+            self.event().await;
+        }
+        Ok(())
+    }
+
+    /// Waits for the next event, and returns it if it is a progress.
+    async fn event(&mut self) -> Option<Value> {
+        let over = || Failure::new(FailureKind::Closed, "the goal has ended");
+        let event = self.events.next().await;
+        match event.unwrap_or_else(|| Err(over())) {
+            Ok(GoalEvent::Accepted) => drop(self.accepted.send_replace(true)),
+            Ok(GoalEvent::Progress(progress)) => return Some(progress),
+            Ok(GoalEvent::Result(result)) => self.end = Some(Ok(result)),
+            Err(failure) => self.end = Some(Err(failure)),
+        }
+        None
     }
 }
 
@@ -278,7 +329,27 @@ impl RemoteGoal {
         Pending::lazy("RemoteGoal.result()", async move {
             let mut led = led.lock().await;
             while led.next().await?.is_some() {}
-            Ok(value(led.result.clone().unwrap_or(Value::Null)))
+            let result = led.end.clone().unwrap_or(Ok(Value::Null))?;
+            Ok(value(result))
+        })
+    }
+
+    /// Waits until the robot accepts the goal. Raises `Refused` if the robot rejects it. The progress stays for the
+    /// iteration.
+    fn accepted(&self) -> Pending {
+        let (led, mut accepted) = (Arc::clone(&self.led), self.accepted.subscribe());
+        Pending::lazy("RemoteGoal.accepted()", async move {
+            // Another wait, which has the lock, may learn it.
+            let known = async { accepted.wait_for(|it| *it).await.is_ok() };
+            let led = tokio::select! {
+                biased;
+                true = known => None,
+                led = led.lock() => Some(led),
+            };
+            if let Some(mut led) = led {
+                led.accepted().await?;
+            }
+            Ok(nothing())
         })
     }
 

@@ -27,14 +27,16 @@ const TIMEOUT: Duration = Duration::from_secs(30);
 
 #[pymethods]
 impl Agent {
-    /// Publishes a topic. `media_type` is for users. With a `rate` in notifications per second, the topic is a stream:
+    /// Publishes a topic. `media_type` is for users. Each notification carries `language` and `ontology`. With a `rate` in notifications per second, the topic is a stream:
     /// subscribers get the newest notification. A new subscriber gets the `latched` newest contents, at most 64.
-    #[pyo3(signature = (topic, *, media_type=None, rate=None, latched=0))]
+    #[pyo3(signature = (topic, *, media_type=None, language=None, ontology=None, rate=None, latched=0))]
     fn publisher(
         &self,
         py: Python<'_>,
         topic: &str,
         media_type: Option<&str>,
+        language: Option<&str>,
+        ontology: Option<&str>,
         rate: Option<f64>,
         latched: usize,
     ) -> PyResult<Publisher> {
@@ -42,6 +44,12 @@ impl Agent {
         let mut described = Topic::new(topic).latched(latched);
         if let Some(media_type) = media_type {
             described = described.media_type(media_type);
+        }
+        if let Some(language) = language {
+            described = described.language(language);
+        }
+        if let Some(ontology) = ontology {
+            described = described.ontology(ontology);
         }
         if let Some(rate) = rate {
             described = described.rate(rate);

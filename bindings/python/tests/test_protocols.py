@@ -147,6 +147,12 @@ class Topics(Loops):
             poses.close()
             self.assertIsNone(await poses.next())
 
+    async def test_notifications_name_their_language_and_ontology(self) -> None:
+        with self.arm.publisher("pose", language="json", ontology="geometry_msgs/Pose", latched=1) as publisher:
+            await publisher.publish("{}")
+            pose = await self.rover.subscribe(self.arm.name, "pose").next()
+            self.assertEqual((pose.language, pose.ontology), ("json", "geometry_msgs/Pose"))
+
     async def test_a_loan_is_published_in_place(self) -> None:
         with self.arm.publisher("image", latched=1) as publisher:
             loan = publisher.loan(1_000_000)
@@ -224,6 +230,63 @@ class Actions(Loops):
         goal.cancel()
         with self.assertRaises(fipa.Cancelled):
             await goal.result()
+
+    async def test_the_program_decides_about_a_goal(self) -> None:
+        with self.arm.goals({"name": "reach", "decides": True, "concurrency": 2}) as goals:
+            sent = self.rover.invoke(self.arm.name, "reach", {})
+            goal = await goals.next()
+            self.assertEqual(goal.client, self.rover.name)
+            self.assertTrue(goal.id)
+            accepted = asyncio.ensure_future(sent.accepted())
+            await asyncio.sleep(0.05)
+            self.assertFalse(accepted.done())
+            other = self.rover.invoke(self.arm.name, "reach", {})
+            rejected = await goals.next()
+            self.assertNotEqual(goal.id, rejected.id)
+            rejected.fail("out of reach")
+            for wait in (other.accepted, other.accepted, other.result):
+                with self.assertRaisesRegex(fipa.Refused, "the robot rejects the goal: out of reach"):
+                    await wait()
+            goal.accept()
+            self.assertIsNone(await accepted)
+            goal.progress(0.5, "near")
+            async for progress in sent:
+                if progress["note"] == "near":
+                    break
+            self.assertIsNone(await sent.accepted())
+            goal.succeed(3)
+            self.assertEqual(await sent.result(), 3)
+            self.assertIsNone(await sent.accepted())
+
+    async def test_a_goal_is_accepted_while_another_wait_has_its_events(self) -> None:
+        with self.arm.goals({"name": "reach", "decides": True}) as goals:
+            sent = self.rover.invoke(self.arm.name, "reach", {})
+            result = asyncio.ensure_future(sent.result())
+            await asyncio.sleep(0.05)
+            goal = await goals.next()
+            goal.accept()
+            await sent.accepted()
+            goal.succeed()
+            self.assertIsNone(await result)
+
+    async def test_a_goal_is_cancelled_before_it_is_accepted(self) -> None:
+        with self.arm.goals({"name": "reach", "decides": True}) as goals:
+            sent = self.rover.invoke(self.arm.name, "reach", {})
+            goal = await goals.next()
+            sent.cancel()
+            accepted = asyncio.ensure_future(sent.accepted())
+            await goal.stopped()
+            goal.fail("stopped")
+            with self.assertRaises(fipa.Cancelled):
+                await accepted
+
+    async def test_goals_need_the_fence_of_a_lock_and_a_wrong_option_is_named(self) -> None:
+        fenced = {"name": "lift", "fenced_by": {"owner": self.arm.name, "resource": "bay"}, "client_gone": "continue"}
+        with self.arm.goals(fenced):
+            with self.assertRaisesRegex(fipa.Refused, "needs the fence of a lock"):
+                await self.rover.invoke(self.arm.name, "lift", {}).accepted()
+        with self.assertRaisesRegex(ValueError, '"client_gone" is "ignore"; expected "cancel" or "continue"'):
+            self.arm.goals({"name": "lift", "client_gone": "ignore"})
 
     async def test_the_time_of_a_goal_is_limited(self) -> None:
         @self.arm.action

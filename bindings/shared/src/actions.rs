@@ -4,9 +4,10 @@ use std::fmt;
 use std::sync::Arc;
 
 use fipa::actions::{
-    Action, ActionDescription, Cause, Execution, Goal, GoalStatus, Progress, Term, term_from_json,
-    term_to_json,
+    Action, ActionDescription, Cause, Execution, Goal, GoalStatus, Orphans, Progress, Term,
+    term_from_json, term_to_json,
 };
+use fipa::locks::Admission;
 use fipa::{Agent, AgentId};
 use futures_core::Stream;
 use parking_lot::Mutex;
@@ -18,7 +19,12 @@ use crate::failure::{Failure, FailureKind, OrFail as _};
 use crate::script::script;
 
 /// Reads the description of an action: a JSON object with a `name` and, as far as they are needed, `description`,
-/// `parameters`, `result`, and `policy`.
+/// `parameters`, `result`, and `policy`. These keys are not part of the description that clients read:
+///
+/// - `concurrency`: the maximum number of goals that run at the same time, 1 if it is left out.
+/// - `client_gone`: `cancel` or `continue`, the treatment of a goal whose client is gone.
+/// - `fenced_by`: an object with `owner` and `resource`, the lock whose fence each goal needs.
+/// - `decides`: whether the client gets no agree before [`Pursuit::accept`].
 ///
 /// # Errors
 /// If the text is not such an object.
@@ -41,9 +47,60 @@ pub fn action_of(text: &str) -> Result<Action, Failure> {
             parameter.entry("optional").or_insert(json!(false));
         }
     }
+    let options = OPTIONS.map(|key| description.remove(key));
     let description: ActionDescription =
         serde_json::from_value(Value::Object(description)).map_err(wrong)?;
-    Ok(Action::from(description))
+    let mut action = Action::from(description);
+    for (key, value) in OPTIONS.into_iter().zip(options) {
+        if let Some(value) = value {
+            action = with_option(action, key, &value)?;
+        }
+    }
+    Ok(action)
+}
+
+/// The keys of a description that clients do not read.
+const OPTIONS: [&str; 4] = ["concurrency", "client_gone", "fenced_by", "decides"];
+
+/// Sets an option of an action.
+fn with_option(action: Action, key: &str, value: &Value) -> Result<Action, Failure> {
+    let wrong = |expected: &str| {
+        Err(Failure::invalid(format!(
+            "the description of the action: {key:?} is {value}; expected {expected}"
+        )))
+    };
+    match key {
+        "concurrency" => match value.as_u64().and_then(|goals| usize::try_from(goals).ok()) {
+            Some(goals) if goals > 0 => Ok(action.concurrency(goals)),
+            _ => wrong("a number of goals from 1"),
+        },
+        "client_gone" => match value.as_str() {
+            Some("cancel") => Ok(action.orphans(Orphans::Cancel)),
+            Some("continue") => Ok(action.orphans(Orphans::Continue)),
+            _ => wrong("\"cancel\" or \"continue\""),
+        },
+        "fenced_by" => {
+            let part = |name: &str| value.get(name).and_then(Value::as_str);
+            let is_known = value.as_object().is_some_and(|object| object.len() == 2);
+            let (Some(owner), Some(resource), true) = (part("owner"), part("resource"), is_known)
+            else {
+                return wrong("an object with the texts owner and resource");
+            };
+            let expected = |error: String| format!("the names of an agent and a resource: {error}");
+            if let Err(error) = AgentId::new(owner) {
+                return wrong(&expected(error.to_string()));
+            }
+            match Admission::new(owner, resource) {
+                Ok(admission) => Ok(action.fenced_by(admission)),
+                Err(error) => wrong(&expected(error.to_string())),
+            }
+        }
+        _ => match value.as_bool() {
+            Some(true) => Ok(action.decided_by_handler()),
+            Some(false) => Ok(action),
+            None => wrong("true or false"),
+        },
+    }
 }
 
 /// A goal that the program pursues. A goal that is dropped without an end fails.
@@ -53,6 +110,22 @@ pub struct Pursuit {
 }
 
 impl Pursuit {
+    /// Returns the id that the client gave the goal.
+    pub fn id(&self) -> &str {
+        self.execution.id()
+    }
+
+    /// Returns the name of the client.
+    pub fn client(&self) -> Option<&str> {
+        self.execution.client().map(AgentId::name)
+    }
+
+    /// Accepts the goal of an action with `decides`: the client gets the agree. Without effect on other goals, and on
+    /// one that is accepted already.
+    pub fn accept(&self) {
+        self.execution.accept();
+    }
+
     /// Reports the progress: an object with `fraction` from 0 to 1, `note` and `value`, each optional.
     ///
     /// # Errors
@@ -80,7 +153,8 @@ impl Pursuit {
         Ok(())
     }
 
-    /// Ends the goal with its result, `None` for an action without one, or with the reason of its failure.
+    /// Ends the goal with its result, `None` for an action without one, or with the reason of its failure. A goal of an
+    /// action with `decides` that fails before it is accepted is refused with that reason.
     ///
     /// # Errors
     /// If the goal has ended already, or SL has no form for the result.
@@ -189,7 +263,19 @@ pub fn invoke(
 ) -> impl Stream<Item = Result<GoalEvent, Failure>> + Send + use<> {
     script(async move |emitter| {
         let robot = agent.robot(robot);
-        let mut running = robot.send(goal).await.or_fail()?;
+        let mut running = robot.propose(goal).await.or_fail()?;
+        loop {
+            tokio::select! {
+                biased;
+                accepted = running.accepted() => {
+                    accepted.or_fail()?;
+                    break;
+                }
+                () = cancel.notified() => {
+                    running.cancel(CANCEL).await.or_fail()?;
+                }
+            }
+        }
         emitter.emit(GoalEvent::Accepted).await;
         // A goal that has ended already has no progress.
         let mut updates = running.progress().await.ok();
@@ -238,4 +324,53 @@ fn term(value: Value, what: &str) -> Result<Term<'static>, Failure> {
 /// Returns a value of another agent in JSON.
 fn json_of(term: &Term<'_>) -> Result<Value, Failure> {
     term_to_json(term).map_err(|error| Failure::new(FailureKind::Failed, error.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_of_an_action_are_read_and_a_wrong_one_is_named() {
+        for options in [
+            json!({"concurrency": 3, "client_gone": "continue", "decides": true}),
+            json!({"concurrency": 1, "client_gone": "cancel", "decides": false}),
+            json!({"fenced_by": {"owner": "crane", "resource": "bay"}}),
+        ] {
+            let mut description = options.clone();
+            description["name"] = json!("dock");
+            let action = format!("{:?}", action_of(&description.to_string()).unwrap());
+            let is = |text: &str| action.contains(text);
+            assert_eq!(
+                is("concurrency: 3"),
+                options["concurrency"] == 3,
+                "{action}"
+            );
+            assert_eq!(is("Continue"), options["client_gone"] == "continue");
+            assert_eq!(is("decides: true"), options["decides"] == true);
+            assert_eq!(is("fenced: true"), !options["fenced_by"].is_null());
+        }
+        for (key, value) in [
+            ("concurrency", json!(0)),
+            ("concurrency", json!(1.5)),
+            ("client_gone", json!("ignore")),
+            ("client_gone", json!(true)),
+            ("fenced_by", json!("bay")),
+            ("fenced_by", json!({"owner": "crane"})),
+            (
+                "fenced_by",
+                json!({"owner": "crane", "resource": "bay", "lock": 1}),
+            ),
+            ("fenced_by", json!({"owner": "", "resource": "bay"})),
+            ("fenced_by", json!({"owner": "crane", "resource": ""})),
+            ("decides", json!("yes")),
+            ("decides", json!(null)),
+        ] {
+            let description = json!({"name": "dock", key: value});
+            let error = action_of(&description.to_string()).unwrap_err();
+            assert_eq!(error.kind, FailureKind::Invalid);
+            let named = format!("{key:?} is {value}; expected ");
+            assert!(error.text.contains(&named), "{error}");
+        }
+    }
 }

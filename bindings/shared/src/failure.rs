@@ -50,7 +50,7 @@ pub enum FailureKind {
 }
 
 /// A failed call.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 #[allow(
     clippy::exhaustive_structs,
     reason = "the interfaces build and take apart failures"

@@ -407,6 +407,33 @@ static void actions(void) {
   OK(fipa_close(goal));
   OK(fipa_close(going));
   OK(fipa_close(offer));
+
+  /* The program decides about each goal. */
+  CHECK(fipa_offer(arm, text("{\"name\": \"grip\", \"decides\": 1}"), 75, &offer) == FIPA_RESULT_INVALID);
+  OK(fipa_offer(arm, text("{\"name\": \"grip\", \"decides\": true}"), 75, &offer));
+  OK(fipa_begin_goal(rover, text("arm"), text("grip"), text(""), 0, -1, 76, &going));
+  goal = next(domain, 75, FIPA_EVENT_GOAL).handle;
+  OK(fipa_goal_accept(goal));
+  next(domain, 76, FIPA_EVENT_ACCEPTED);
+  OK(fipa_goal_accept(goal));
+  OK(fipa_goal_end(goal, 1, text("")));
+  do {
+    memset(&item, 0, sizeof item);
+    item.size = sizeof item;
+    OK(fipa_next(domain, LONG, &item));
+    CHECK(item.tag == 76 && (item.kind == FIPA_EVENT_PROGRESS || item.kind == FIPA_EVENT_RESULT));
+    OK(fipa_close(item.handle));
+  } while (item.kind != FIPA_EVENT_RESULT);
+  OK(fipa_close(goal));
+  CHECK(fipa_goal_accept(goal) == FIPA_RESULT_BAD_HANDLE);
+  OK(fipa_close(going));
+  OK(fipa_begin_goal(rover, text("arm"), text("grip"), text(""), 0, -1, 77, &going));
+  goal = next(domain, 75, FIPA_EVENT_GOAL).handle;
+  OK(fipa_goal_end(goal, 0, text("no power")));
+  CHECK(next(domain, 77, FIPA_EVENT_ENDED).result == FIPA_RESULT_REFUSED);
+  OK(fipa_close(goal));
+  OK(fipa_close(going));
+  OK(fipa_close(offer));
 }
 
 static void topics(void) {
