@@ -11,28 +11,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import fipa
-from fipa.ros2.mapping import Mapping, WrongMapping, read
+from fipa.ros2 import mapping
+from fipa.ros2.mapping import Mapping, WrongMapping
 
-_EXAMPLES = """\
+_EXAMPLES = f"""\
 examples:
   fipa-ros2 --list > robot.toml       write what could be mapped, then remove what agents must not reach
   fipa-ros2 robot.toml                bridge what the file names
   fipa-ros2 robot.toml --ros-args -p use_sim_time:=true
   fipa do crex navigate order=10      then let the robot crex perform its action /crex/navigate
 
-mapping:
-  actions = ["/crex/navigate"]        # of ROS, for agents; patterns such as "/crex/*" name several
-  services = ["/crex/set_speed"]
-  topics = ["/crex/pose", "/crex/image"]
-  robot = "crex"                      # the agent of names without a namespace
-  [settings."/crex/image"]
-  content = "cdr"                     # or "json", the default
-  [settings."/crex/navigate"]
-  client_gone = "continue"            # or "cancel", the default
-  fenced_by = ["door", "passage"]     # a goal needs the fence of a lock: owner and resource
-  [agents.arm_1.actions]              # of agents, for ROS; also services and topics
-  move = "arm_interfaces/action/Move"
-"""
+{mapping.__doc__}"""
 
 _log = logging.getLogger("fipa.ros2")
 
@@ -47,8 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     split = given.index("--ros-args") if "--ros-args" in given else len(given)
     parser = argparse.ArgumentParser(
         prog="fipa-ros2",
-        description="Bridges ROS 2 and agents: what a mapping names, in both directions. Runs in the environment of the "
-        "robot, with its rclpy and its types.",
+        description="Bridges ROS 2 and agents: what a mapping names. Runs in the environment of the robot, "
+        "with its rclpy and its types.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -60,18 +49,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(given[:split])
     if options.list == (options.mapping is not None):
         parser.error("expected a mapping FILE, or --list")
-    logging.basicConfig(
-        format="%(asctime)s %(levelname)s %(message)s", level=logging.DEBUG if options.verbose else logging.INFO
-    )
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s")
+    logging.getLogger("fipa").setLevel(logging.INFO if options.verbose else logging.WARNING)
+    _log.setLevel(logging.DEBUG if options.verbose else logging.INFO)
     try:
-        mapping = None if options.list else read(options.mapping)
+        wanted = None if options.list else mapping.read(options.mapping)
     except (WrongMapping, OSError) as error:
         return _failed(error)
     try:
-        from rclpy.exceptions import InvalidHandle  # noqa: F401
+        import rclpy
     except ModuleNotFoundError as error:
-        return _failed(f"{error.name} is missing: source the setup file of ROS 2, for example /opt/ros/kilted/setup.bash")
-    return asyncio.run(_run(mapping, options.config, options.name, given[split:]))
+        return _failed(f"{error.name} is missing: source ROS 2, for example /opt/ros/kilted/setup.bash")
+    _log.debug("rclpy is in %s", rclpy.__path__)
+    return asyncio.run(_run(wanted, options.config, options.name, given[split:]))
 
 
 def _failed(error: object) -> int:
@@ -79,7 +69,7 @@ def _failed(error: object) -> int:
     return 1
 
 
-async def _run(mapping: Mapping | None, config: str | None, name: str, ros_arguments: Sequence[str]) -> int:
+async def _run(wanted: Mapping | None, config: str | None, name: str, ros_arguments: Sequence[str]) -> int:
     from fipa.ros2 import graph
     from fipa.ros2.bridge import Bridge
     from fipa.ros2.ros import Ros
@@ -88,13 +78,13 @@ async def _run(mapping: Mapping | None, config: str | None, name: str, ros_argum
     loop = asyncio.get_running_loop()
     ros = Ros(ros_arguments, loop)
     try:
-        if mapping is None:
+        if wanted is None:
             print(f"Looking at the graph of ROS for {_DISCOVERY:.0f} s", file=sys.stderr)
             await asyncio.sleep(_DISCOVERY)
             print(graph.listing(await ros.call(graph.all_entities, ros.node)), end="")
             return 0
         with fipa.Domain(config) as domain:
-            running = loop.create_task(Bridge(ros, domain, mapping, name).run())
+            running = loop.create_task(Bridge(ros, domain, wanted, name).run())
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.add_signal_handler(number, running.cancel)
             _log.info("the bridge runs; Ctrl-C ends it")

@@ -24,28 +24,42 @@ LONGEST_PAUSE = 5.0
 DEPTH = 10
 
 
-class AgentAction:
-    """An action of an agent, as an action server of ROS."""
+class Offered:
+    """Something of an agent for ROS."""
 
     def __init__(self, ros: Ros, own: fipa.Agent, agent: str, word: str, kind: Any) -> None:
+        """Called in the thread of ROS, as `close` is."""
         self._ros = ros
         self._own = own
         self._agent = agent
         self._word = word
         self._kind = kind
+        self._name = f"/{agent}/{word}"
+        self._open()
+
+    def _open(self) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+
+class AgentAction(Offered):
+    """An action of an agent, as an action server of ROS."""
+
+    def _open(self) -> None:
         #: The goals that the agent has accepted, by the identity of the message of ROS.
         self._accepted: dict[int, tuple[Any, fipa.RemoteGoal]] = {}
         self._server = ActionServer(
-            ros.node,
-            kind,
-            f"/{agent}/{word}",
+            self._ros.node,
+            self._kind,
+            self._name,
             execute_callback=self._execute,
             goal_callback=self._decide,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
     def close(self) -> None:
-        """Called in the thread of ROS."""
         self._server.destroy()
 
     async def _decide(self, message: Any) -> GoalResponse:
@@ -58,7 +72,7 @@ class AgentAction:
             goal = await self._ros.ask(invoke)
         except (fipa.Error, Full) as error:
             # ROS has no reason for a rejected goal.
-            _log.warning("/%s/%s: a goal is rejected: %s", self._agent, self._word, error)
+            _log.warning("%s: a goal is rejected: %s", self._name, error)
             return GoalResponse.REJECT
         self._accepted[id(message)] = (message, goal)
         return GoalResponse.ACCEPT
@@ -80,7 +94,7 @@ class AgentAction:
         try:
             result = await self._ros.ask(follow)
         except (fipa.Error, values.Mismatch, Full) as error:
-            _log.warning("/%s/%s: %s", self._agent, self._word, error)
+            _log.warning("%s: %s", self._name, error)
             if handle.is_cancel_requested:
                 handle.canceled()
             else:
@@ -95,22 +109,16 @@ class AgentAction:
         goal.cancel()
 
 
-class AgentService:
+class AgentService(Offered):
     """The requests of an agent, as a service of ROS."""
 
-    def __init__(self, ros: Ros, own: fipa.Agent, agent: str, word: str, kind: Any) -> None:
-        self._ros = ros
-        self._own = own
-        self._agent = agent
-        self._word = word
-        self._kind = kind
-        self._service = ros.node.create_service(kind, f"/{agent}/{word}", self._answer)
+    def _open(self) -> None:
+        self._service = self._ros.node.create_service(self._kind, self._name, self._answer)
         self._send = self._service.send_response
         # ROS has no failure of a service: a request that fails has no answer, so that no client takes it for a success.
         self._service.send_response = self._send_if_any
 
     def close(self) -> None:
-        """Called in the thread of ROS."""
         self._ros.node.destroy_service(self._service)
 
     def _send_if_any(self, response: Any, header: Any) -> None:
@@ -131,7 +139,7 @@ class AgentService:
             return await self._ros.ask(request)
         except (fipa.Error, values.Mismatch, Full) as error:
             reason = str(error)
-        _log.warning("/%s/%s: no answer: %s", self._agent, self._word, reason)
+        _log.warning("%s: no answer: %s", self._name, reason)
         response = self._kind.Response()
         if hasattr(response, "success") and hasattr(response, "message"):
             # As in std_srvs.
@@ -140,21 +148,15 @@ class AgentService:
         return None
 
 
-class AgentTopic:
+class AgentTopic(Offered):
     """A topic of an agent, as a topic of ROS."""
 
-    def __init__(self, ros: Ros, own: fipa.Agent, agent: str, word: str, kind: Any) -> None:
-        self._ros = ros
-        self._own = own
-        self._agent = agent
-        self._word = word
-        self._kind = kind
-        self._publisher = ros.node.create_publisher(kind, f"/{agent}/{word}", QoSProfile(depth=DEPTH))
-        ros.soon(self._begin)
+    def _open(self) -> None:
+        self._publisher = self._ros.node.create_publisher(self._kind, self._name, QoSProfile(depth=DEPTH))
         self._task: asyncio.Task[None] | None = None
+        self._ros.soon(self._begin)
 
     def close(self) -> None:
-        """Called in the thread of ROS."""
         self._ros.soon(self._end)
         self._ros.node.destroy_publisher(self._publisher)
 
@@ -174,7 +176,7 @@ class AgentTopic:
                         pause = 1.0
                         self._publish(letter)
             except fipa.Error as error:
-                _log.info("/%s/%s: %s; next attempt in %.0f s", self._agent, self._word, error, pause)
+                _log.info("%s: %s; next attempt in %.0f s", self._name, error, pause)
             await asyncio.sleep(pause)
             pause = min(pause * 2, LONGEST_PAUSE)
 
@@ -192,7 +194,7 @@ class AgentTopic:
                     return
                 except ValueError as error:
                     wrong = str(error)
-        _log.warning("/%s/%s: a notification is dropped: %s", self._agent, self._word, wrong)
+        _log.warning("%s: a notification is dropped: %s", self._name, wrong)
 
 
 #: What agents offer, by kind, as in the mapping.

@@ -32,7 +32,7 @@ class _Robot:
         self.agent = agent
         self.requests: robots.Requests | None = None
         #: What is open, by kind and name of ROS.
-        self.open: dict[tuple[str, str], tuple[tuple[str, ...], robots.Mapped]] = {}
+        self.open: dict[tuple[str, str], tuple[Entity, robots.Mapped]] = {}
         self.listed: set[tuple[str, str]] = set()
 
 
@@ -108,12 +108,13 @@ class Bridge:
         """Opens what has appeared, and closes what has gone."""
         present = {(it.kind, it.name): it for it in found}
         for name, robot in list(self._robots.items()):
-            for key, (types, mapped) in list(robot.open.items()):
+            for key, (known, mapped) in list(robot.open.items()):
                 entity = present.get(key)
-                if entity is not None and types == entity.types:
+                if entity is not None and entity.types == known.types and entity.servers >= known.servers:
+                    robot.open[key] = (entity, mapped)
                     continue
-                why = "has gone" if entity is None else f"has changed its type to {', '.join(entity.types)}"
-                _log.info("%s %s", key[1], why)
+                has_changed = entity is not None and entity.types != known.types
+                _log.info("%s %s", key[1], "has changed its type" if has_changed else "has gone")
                 del robot.open[key]
                 if robot.requests is not None and key[0] == "services":
                     robot.requests.services.pop(key[1].rsplit("/", 1)[1], None)
@@ -129,8 +130,8 @@ class Bridge:
         if len(entity.types) > 1:
             self._warn(entity, f"has several types: {', '.join(entity.types)}")
             return
-        if entity.kind != "topics" and entity.servers > 1:
-            self._warn(entity, f"has {entity.servers} servers; one is expected")
+        if len(entity.servers) > 1:
+            self._warn(entity, f"has {len(entity.servers)} servers; one is expected")
             return
         place = self._mapping.agent_of(entity.name)
         if place is None:
@@ -143,7 +144,7 @@ class Bridge:
         except (UnknownType, fipa.Error) as error:
             self._warn(entity, f"is not mapped: {error}")
             return
-        robot.open[entity.kind, entity.name] = (entity.types, mapped)
+        robot.open[entity.kind, entity.name] = (entity, mapped)
         robot.listed.clear()
         self._list_at = 0.0
         self._tasks.start(mapped.run())
@@ -187,14 +188,13 @@ class Bridge:
             return
         self._list_at = loop.time() + DIRECTORY_PAUSE
         for robot in self._robots.values():
-            for key, (types, _) in robot.open.items():
+            for key, (entity, _) in robot.open.items():
                 kind, name = key
                 if kind == "topics" or key in robot.listed:
                     continue
                 try:
-                    await robot.agent.register_service(
-                        _one(kind), name.rsplit("/", 1)[1], properties={"ros-type": types[0]}, protocols=["fipa-request"]
-                    )
+                    word, properties = name.rsplit("/", 1)[1], {"ros-type": entity.types[0]}
+                    await robot.agent.register_service(_one(kind), word, properties=properties)
                 except fipa.Error as error:
                     _log.debug("the directory does not list %s: %s", name, error)
                     return

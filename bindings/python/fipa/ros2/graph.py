@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.action import get_action_names_and_types
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from fipa.ros2.mapping import Mapping
 from fipa.ros2.ros import NODE
@@ -16,7 +16,7 @@ from fipa.ros2.ros import NODE
 #: Services of the packages that control nodes: parameters, lifecycle, components. `--list` comments them out.
 CONTROLS = ("rcl_interfaces", "lifecycle_msgs", "type_description_interfaces", "composition_interfaces")
 
-_SEND_GOAL = "/_action/send_goal"
+_STATUS = "/_action/status"
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Entity:
     name: str
     #: The types that nodes give it; more than one is a mistake of theirs.
     types: tuple[str, ...]
-    #: Number of its servers or publishers.
-    servers: int = 1
+    #: Its servers: an id of each, as far as ROS tells one. One that was started again has another id.
+    servers: frozenset[object] = frozenset()
     #: The lifecycle nodes that offer it.
     lifecycle: tuple[str, ...] = ()
 
@@ -47,26 +47,28 @@ def mapped_entities(node: Node, mapping: Mapping) -> list[Entity]:
     named = [it for it in all_entities(node) if mapping.maps(it.kind, it.name)]
     if not named:
         return []
-    servers = _servers(node)
+    nodes = _nodes_of_services(node)
     entities = []
     for entity in named:
-        if entity.kind == "topics":
-            by = [_full(it.node_namespace, it.node_name) for it in node.get_publishers_info_by_topic(entity.name)]
-            count = len(by)
+        servers: Iterable[object] = ()
+        if entity.kind == "services":
+            by = nodes.get(entity.name, [])
+            # ROS numbers no servers of services.
+            servers = range(node.count_services(entity.name))
         else:
-            service = entity.name + _SEND_GOAL if entity.kind == "actions" else entity.name
-            by, count = servers.get(service, []), node.count_services(service)
+            topic = entity.name + _STATUS if entity.kind == "actions" else entity.name
+            publishers = node.get_publishers_info_by_topic(topic)
+            by = [_full(it.node_namespace, it.node_name) for it in publishers]
+            if entity.kind == "actions":
+                servers = (bytes(it.endpoint_gid) for it in publishers)
         others = [name for name in by if not _is_bridge(name)]
-        # A node that was discovered only in part has no name yet.
-        unnamed = count - len(by)
-        if others or unnamed > 0:
-            lifecycle = tuple(name for name in others if f"{name}/get_state" in servers)
-            entities.append(Entity(entity.kind, entity.name, entity.types, len(others) + unnamed, lifecycle))
+        if others:
+            lifecycle = tuple(name for name in others if f"{name}/get_state" in nodes)
+            entities.append(Entity(entity.kind, entity.name, entity.types, frozenset(servers), lifecycle))
     return entities
 
 
-def _servers(node: Node) -> dict[str, list[str]]:
-    """The nodes of each service."""
+def _nodes_of_services(node: Node) -> dict[str, list[str]]:
     servers: dict[str, list[str]] = {}
     for name, namespace in set(node.get_node_names_and_namespaces()):
         for service in _services_of(node, name, namespace):
@@ -90,16 +92,17 @@ def _is_bridge(name: str) -> bool:
     return name.rsplit("/", 1)[1].startswith(NODE)
 
 
-def quality(node: Node, name: str) -> tuple[Any, Any, int]:
-    """Reliability, durability and depth for a subscription that every publisher of a topic fits."""
-    profiles = [it.qos_profile for it in node.get_publishers_info_by_topic(name)]
-    reliable = all(it.reliability == ReliabilityPolicy.RELIABLE for it in profiles)
-    local = all(it.durability == DurabilityPolicy.TRANSIENT_LOCAL for it in profiles)
+def profile(node: Node, topic: str, longest: int) -> QoSProfile:
+    """The policies of a subscription that fits every publisher of a topic."""
+    profiles = [it.qos_profile for it in node.get_publishers_info_by_topic(topic)]
+    is_reliable = all(it.reliability == ReliabilityPolicy.RELIABLE for it in profiles)
+    is_kept = all(it.durability == DurabilityPolicy.TRANSIENT_LOCAL for it in profiles)
     depth = max((it.depth for it in profiles), default=0)
-    return (
-        ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        DurabilityPolicy.TRANSIENT_LOCAL if profiles and local else DurabilityPolicy.VOLATILE,
-        depth,
+    return QoSProfile(
+        # ROS does not tell every depth.
+        depth=min(max(depth, 1 if is_kept else 10), longest),
+        reliability=ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if is_kept else DurabilityPolicy.VOLATILE,
     )
 
 
@@ -107,7 +110,7 @@ def listing(entities: Iterable[Entity]) -> str:
     """A mapping of everything. What controls nodes is commented out."""
     lines = [
         "# A mapping of fipa-ros2: what agents reach. Remove what they must not reach.",
-        "# Patterns such as \"/crex/*\" name several. Settings and the agents that ROS reaches: see `fipa-ros2 --help`.",
+        '# Patterns such as "/crex/*" name several. Settings, and agents for ROS: see `fipa-ros2 --help`.',
     ]
     by_name = sorted(entities, key=lambda it: it.name)
     for kind in ("actions", "services", "topics"):

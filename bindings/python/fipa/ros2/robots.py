@@ -13,7 +13,8 @@ from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, qos_profile_action_status_default
+from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
 import fipa
@@ -24,16 +25,19 @@ from fipa.ros2.ros import Full, Inbox, Ros
 
 _log = logging.getLogger("fipa.ros2")
 
-#: The space of the ids of goals. A goal that its client sends again has the same id, so the server runs it once.
-SPACE = uuid.UUID("8d5a2c7e-0c53-5c0f-9a55-6b1b5a3f7d10")
+#: The space of the ids of goals.
+_SPACE = uuid.UUID("8d5a2c7e-0c53-5c0f-9a55-6b1b5a3f7d10")
 
-#: Maximum number of messages of a topic that wait for the agent.
+#: Maximum number of messages of a topic that wait for the agent, and that the agent keeps for new subscribers.
 WAITING = 64
 
-#: Maximum number of contents that a topic keeps for new subscribers.
-LATCHED = 64
+#: Time for the answer of an action server to a goal, in seconds. The client waits ten seconds.
+ANSWER = 5.0
 
-_GONE = "gone: the server in ROS has died or ended"
+
+def goal_id(client: str | None, goal: str) -> uuid.UUID:
+    """The id in ROS of a goal. A goal that its client sends again has the same one, so the server runs it once."""
+    return uuid.uuid5(_SPACE, f"{client}\n{goal}")
 
 
 class Mapped(Protocol):
@@ -79,7 +83,7 @@ class Action:
         #: The goals that the server has, by id: also those of an earlier bridge.
         self._known: dict[bytes, int] = {}
         self._status = ros.node.create_subscription(
-            GoalStatusArray, f"{name}/_action/status", self._list_goals, _LAST_STATUS
+            GoalStatusArray, f"{name}/_action/status", self._list_goals, qos_profile_action_status_default
         )
         self.name = name
         self.goals = agent.goals(describe.action(word, kind, settings))
@@ -104,10 +108,8 @@ class Action:
     async def _pursue(self, goal: fipa.Goal) -> None:
         try:
             reason = await self._lead(goal)
-        except (values.Mismatch, Full) as error:
+        except (values.Mismatch, Full, _Gone) as error:
             reason = str(error)
-        except _Gone:
-            reason = _GONE
         if reason is not None:
             try:
                 goal.fail(reason)
@@ -120,15 +122,17 @@ class Action:
         message = values.from_json(self._kind.Goal, goal.arguments)
         if self._ros.node.count_services(f"{self.name}/_action/send_goal") > 1:
             return f"{self.name} has more than one action server"
-        identity = UUID(uuid=list(uuid.uuid5(SPACE, f"{goal.client}\n{goal.id}").bytes))
+        identity = UUID(uuid=list(goal_id(goal.client, goal.id).bytes))
         feedback = Inbox(self._ros, 1)
         gone = asyncio.ensure_future(self._gone.wait())
         stopped = asyncio.ensure_future(_wait(goal.stopped()))
-        reporting = asyncio.ensure_future(_report(goal, feedback))
-        result: asyncio.Future[Any] | None = None
+        waits = [gone, stopped, asyncio.ensure_future(_report(goal, feedback))]
         try:
-            sent = self._ros.call(self._send, message, feedback, identity)
-            handle = await _unless(gone, asyncio.ensure_future(sent))
+            sending = _Sending(self._client, message, identity, feedback)
+            try:
+                handle = await _unless(gone, asyncio.ensure_future(self._ros.call(sending.begin)), ANSWER)
+            except TimeoutError:
+                return "the action server does not answer; it may have died"
             if not handle.accepted:
                 if bytes(identity.uuid) not in self._known:
                     return "the action server rejects the goal"
@@ -136,31 +140,41 @@ class Action:
                 accepted = self._kind.Impl.SendGoalService.Response(accepted=True)
                 handle = ClientGoalHandle(self._client, identity, accepted)
             goal.accept()
-            result = asyncio.ensure_future(self._ros.call(handle.get_result_async))
+            waits.append(result := asyncio.ensure_future(self._ros.call(handle.get_result_async)))
             await asyncio.wait({result, gone, stopped}, return_when=asyncio.FIRST_COMPLETED)
             if stopped.done() and not result.done():
                 await _unless(gone, asyncio.ensure_future(self._ros.call(handle.cancel_goal_async)))
             return _end(goal, await _unless(gone, result))
         finally:
-            for task in (gone, stopped, reporting, result):
-                if task is not None:
-                    task.cancel()
-
-    def _send(self, message: Any, feedback: Inbox, identity: UUID) -> Any:
-        return self._client.send_goal_async(message, lambda it: feedback.put(it.feedback), identity)
+            for task in waits:
+                task.cancel()
 
 
-#: Of the status of an action.
-_LAST_STATUS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+class _Sending:
+    """A goal that is sent. If the bridge has given up when the server accepts it, it is canceled."""
+
+    def __init__(self, client: ActionClient, message: Any, identity: UUID, feedback: Inbox) -> None:
+        self._client = client
+        self._goal = (message, lambda it: feedback.put(it.feedback), identity)
+        self._answer: Future[Any] = Future()
+
+    def begin(self) -> Future[Any]:
+        """Called in the thread of ROS, as the callbacks are."""
+        self._client.send_goal_async(*self._goal).add_done_callback(self._answered)
+        return self._answer
+
+    def _answered(self, sent: Future[Any]) -> None:
+        if not self._answer.cancelled():
+            self._answer.set_result(sent.result())
+        elif (handle := sent.result()) is not None and handle.accepted:
+            handle.cancel_goal_async()
 
 
 class _Gone(Exception):
     """The server has died."""
+
+    def __str__(self) -> str:
+        return "gone: the server in ROS has died or ended"
 
 
 async def _wait(pending: Any) -> Any:
@@ -173,13 +187,15 @@ async def _report(goal: fipa.Goal, feedback: Inbox) -> None:
         goal.progress(value=values.to_json(message))
 
 
-async def _unless(gone: asyncio.Future[Any], work: asyncio.Future[Any]) -> Any:
-    """Waits for the work, unless the server dies. Raises `_Gone`."""
-    await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
-    if not work.done():
-        work.cancel()
+async def _unless(gone: asyncio.Future[Any], work: asyncio.Future[Any], within: float | None = None) -> Any:
+    """Waits for the work, unless the server dies. Raises `_Gone` and `TimeoutError`."""
+    await asyncio.wait({work, gone}, timeout=within, return_when=asyncio.FIRST_COMPLETED)
+    if work.done():
+        return work.result()
+    work.cancel()
+    if gone.done():
         raise _Gone
-    return work.result()
+    raise TimeoutError
 
 
 def _end(goal: fipa.Goal, response: Any) -> str | None:
@@ -223,20 +239,18 @@ class Service:
         gone = asyncio.ensure_future(self._gone.wait())
         work = asyncio.ensure_future(self._ros.call(self._client.call_async, message))
         cancelled = asyncio.ensure_future(_wait(task.cancelled()))
+        cancelled.add_done_callback(lambda _: work.cancel())
         try:
-            await asyncio.wait({work, gone, cancelled}, return_when=asyncio.FIRST_COMPLETED)
-            if work.done():
-                await task.inform(written(task.letter, values.to_json(work.result())))
-            elif gone.done():
-                await task.fail(_GONE)
-            else:
-                # ROS has no cancel of a service: its answer is ignored.
-                await task.inform("cancelled")
-        except Full as error:
+            answer = await _unless(gone, work)
+            await task.inform(written(task.letter, values.to_json(answer)))
+        except asyncio.CancelledError:
+            # ROS has no cancel of a service: its answer is ignored.
+            await task.inform("cancelled")
+        except (_Gone, Full) as error:
             await task.fail(str(error))
         finally:
-            for each in (gone, work, cancelled):
-                each.cancel()
+            gone.cancel()
+            cancelled.cancel()
 
 
 class Requests:
@@ -292,20 +306,14 @@ class Topic:
         self._ros = ros
         self.name = name
         self._is_raw = content == "cdr"
-        reliability, durability, depth = graph.quality(ros.node, name)
-        keeps = durability == DurabilityPolicy.TRANSIENT_LOCAL
+        profile = graph.profile(ros.node, name, WAITING)
+        is_kept = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._inbox = Inbox(ros, WAITING)
         self._publisher = agent.publisher(
             word,
             language="ros2-cdr" if self._is_raw else "json",
             ontology=types.name_of(kind),
-            latched=min(max(depth, 1), LATCHED) if keeps else 0,
-        )
-        profile = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST,
-            depth=min(max(depth, 10), WAITING),
-            reliability=reliability,
-            durability=durability,
+            latched=profile.depth if is_kept else 0,
         )
         self._subscription = ros.node.create_subscription(
             kind, name, self._inbox.put, profile, raw=self._is_raw, event_callbacks=mismatch(ros, name)

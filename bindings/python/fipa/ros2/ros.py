@@ -70,26 +70,36 @@ class Ros:
         if self._calls >= MAX_CALLS:
             raise Full(f"{MAX_CALLS} calls wait for ROS already")
         done: asyncio.Future[Any] = self.loop.create_future()
+        awaited: list[Future[Any]] = []
 
-        def settle(future: Future[Any]) -> None:
-            error = future.exception()
-            self.soon(_settle, done, None if error else future.result(), error)
+        def settle(settled: Callable[[Any], None], value: Any) -> None:
+            self.soon(lambda: None if done.done() else settled(value))
+
+        def finish(future: Future[Any]) -> None:
+            if (error := future.exception()) is not None:
+                settle(done.set_exception, error)
+            else:
+                settle(done.set_result, future.result())
 
         def run() -> None:
             try:
                 result = function(*arguments)
             except Exception as error:
-                self.soon(_settle, done, None, error)
+                settle(done.set_exception, error)
                 return
             if isinstance(result, Future):
-                result.add_done_callback(settle)
+                awaited.append(result)
+                result.add_done_callback(finish)
             else:
-                self.soon(_settle, done, result, None)
+                settle(done.set_result, result)
 
         self._calls += 1
         try:
             self._executor.create_task(run)
             return await done
+        except asyncio.CancelledError:
+            self._executor.create_task(lambda: [future.cancel() for future in awaited])
+            raise
         finally:
             self._calls -= 1
 
@@ -101,18 +111,20 @@ class Ros:
 
         async def run() -> None:
             try:
-                result, error = await work(), None
-            except Exception as caught:
-                result, error = None, caught
+                settled, value = answer.set_result, await work()
+            except Exception as error:
+                settled, value = answer.set_exception, error
             # In the thread of ROS, so that the executor wakes up.
-            self._executor.create_task(answer.set_exception if error else answer.set_result, error or result)
+            self._executor.create_task(settled, value)
 
         self._asked += 1
+        # The loop has only a weak reference to the task.
+        running = asyncio.run_coroutine_threadsafe(run(), self.loop)
         try:
-            self.soon(lambda: _keep(self.loop.create_task(run())))
             return await answer
         finally:
             self._asked -= 1
+            running.cancel()
 
     def soon(self, function: Callable[..., Any], *arguments: Any) -> None:
         """Calls a function in the loop; not if the loop is closed."""
@@ -120,24 +132,6 @@ class Ros:
             self.loop.call_soon_threadsafe(function, *arguments)
         except RuntimeError:
             pass
-
-
-#: The loop has only weak references to its tasks.
-_kept: set[asyncio.Task[Any]] = set()
-
-
-def _keep(task: asyncio.Task[Any]) -> None:
-    _kept.add(task)
-    task.add_done_callback(_kept.discard)
-
-
-def _settle(done: asyncio.Future[Any], result: Any, error: BaseException | None) -> None:
-    if done.done():
-        return
-    if error is None:
-        done.set_result(result)
-    else:
-        done.set_exception(error)
 
 
 class Inbox:

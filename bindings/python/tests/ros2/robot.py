@@ -72,7 +72,7 @@ class Robot(Node):
                 goal.canceled()
                 return Fibonacci.Result(sequence=numbers)
             time.sleep(STEP)
-            numbers.append(numbers[-1] + numbers[-2])
+            numbers.append((numbers[-1] + numbers[-2]) % 1_000_000)
             goal.publish_feedback(Fibonacci.Feedback(sequence=numbers))
         if goal.request.order == 13:
             self.write(name, "aborted")

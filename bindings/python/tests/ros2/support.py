@@ -17,6 +17,13 @@ HERE = Path(__file__).parent
 #: Maximum wait for what must happen, in seconds. A test that passes does not wait for it.
 LONG = 60.0
 
+_CONFIGURATION = """
+[mts]
+transports = ["shm", "unix"]
+[discovery]
+mdns = false
+"""
+
 
 def until(happened: Callable[[], Any], what: str) -> Any:
     """Waits until a function returns something true, and returns that."""
@@ -35,7 +42,7 @@ class Site:
         self._directory = tempfile.TemporaryDirectory()
         self.path = Path(self._directory.name)
         self.config = self.path / "fipa.toml"
-        self.config.write_text(f'domain = "ros2-{os.getpid()}"\nruntime_dir = "{self.path}/run"\n')
+        self.config.write_text(f'domain = "ros2-{os.getpid()}"\nruntime_dir = "{self.path}/run"\n' + _CONFIGURATION)
         # Above 101, the ports of Fast DDS are those that the system gives to clients.
         number = str(os.getpid() % 100 + 1)
         self.environment = {

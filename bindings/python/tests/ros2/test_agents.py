@@ -116,7 +116,7 @@ def count_up(goal: fipa.Goal, order: int) -> dict[str, list[int]]:
     stopped = threading.Event()
     while len(numbers) < order and goal.stop_reason is None:
         stopped.wait(0.05)
-        numbers.append(numbers[-1] + numbers[-2])
+        numbers.append((numbers[-1] + numbers[-2]) % 1_000_000)
         if order < 100:
             goal.progress(value={"sequence": numbers})
     return {"sequence": numbers if order < 100 else []}
