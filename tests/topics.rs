@@ -304,6 +304,29 @@ async fn a_new_subscriber_gets_the_latched_contents_at_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn each_notification_names_its_language_and_ontology() {
+    let (here, there) = support::two(&config(&[])).await;
+    let agent = here.register("camera").await.unwrap();
+    let pose = Topic::new("pose").language("json").ontology("poses");
+    let (pose, map) = (agent.publisher(pose.latched(1)), agent.publisher("map"));
+    let (pose, map) = (pose.unwrap(), map.unwrap());
+    pose.publish("{}").await;
+    let rover = there.register("rover").await.unwrap();
+    let mut poses = subscribed(&rover, Keep::All, "pose").await.unwrap();
+    for _ in 0..2 {
+        let notification = poses.next().await.unwrap();
+        assert_eq!(notification.language(), Some("json"));
+        assert_eq!(notification.ontology(), Some("poses"));
+        pose.publish("{}").await;
+    }
+    let mut maps = subscribed(&rover, Keep::All, "map").await.unwrap();
+    map.publish("a").await;
+    let notification = maps.next().await.unwrap();
+    assert_eq!(notification.language(), None);
+    assert_eq!(notification.ontology(), None);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_program_that_does_not_read_keeps_the_newest_and_other_messages_arrive() {
     let (here, there) = support::two(&config(&[])).await;
     let agent = here.register("camera").await.unwrap();

@@ -98,8 +98,8 @@ impl Action {
 
     /// Lets the handler decide about each goal. The client gets the `agree` when the handler calls
     /// [`Execution::accept`](super::Execution::accept), or returns a result. If the handler returns an error before, the
-    /// goal is refused with that reason ([`Refusal::Rejected`](super::Refusal::Rejected)). A goal that waits in a queue
-    /// gets its `agree` when the handler accepts it.
+    /// goal is refused with that reason ([`Refusal::Rejected`](super::Refusal::Rejected)). The policy applies before the
+    /// decision: a goal waits in the queue, or stops an earlier one, without an `agree`.
     ///
     /// ```no_run
     /// use fipa::actions::{Action, Execution};

@@ -523,6 +523,14 @@ impl Execution {
         self.table.change(|executor, _| executor.accept(goal));
     }
 
+    /// Ends the goal at once, with its result, `None` for an action without one, or with the reason of its failure. The
+    /// value that the handler returns afterwards is ignored.
+    pub fn end(&self, result: Result<Option<Term<'static>>, String>) {
+        let (goal, outcome) = (self.goal, result.map_err(Failure::Failed));
+        self.table
+            .change(|executor, now| executor.ended(now, goal, outcome));
+    }
+
     /// Reports progress. Clients get at most ten reports of a goal per second, and always the last one.
     pub fn progress(&self, progress: Progress) {
         let goal = self.goal;

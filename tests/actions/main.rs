@@ -445,7 +445,10 @@ async fn a_handler_that_decides_accepts_or_rejects_goals() {
                         if goal["distance"] > 0.8 {
                             return Err("out of reach");
                         }
-                        gate.acquire().await.unwrap().forget();
+                        tokio::select! {
+                            permit = gate.acquire() => permit.unwrap().forget(),
+                            _ = run.stopped() => return Err("stopped"),
+                        }
                         run.accept();
                         gate.acquire().await.unwrap().forget();
                         Ok(goal["distance"])

@@ -258,6 +258,16 @@ class Actions(Loops):
             self.assertEqual(await sent.result(), 3)
             self.assertIsNone(await sent.accepted())
 
+    async def test_a_goal_that_ends_before_its_action_has_its_own_outcome(self) -> None:
+        for number in range(20):
+            goals = self.arm.goals({"name": "reach"})
+            sent = self.rover.invoke(self.arm.name, "reach", {})
+            goal = await goals.next()
+            goal.fail(f"reason {number}")
+            goals.close()
+            with self.assertRaisesRegex(fipa.Refused, f"reason {number}"):
+                await sent.result()
+
     async def test_a_goal_is_accepted_while_another_wait_has_its_events(self) -> None:
         with self.arm.goals({"name": "reach", "decides": True}) as goals:
             sent = self.rover.invoke(self.arm.name, "reach", {})

@@ -106,7 +106,7 @@ fn with_option(action: Action, key: &str, value: &Value) -> Result<Action, Failu
 /// A goal that the program pursues. A goal that is dropped without an end fails.
 pub struct Pursuit {
     execution: Arc<Execution>,
-    end: Mutex<Option<oneshot::Sender<Result<Term<'static>, String>>>>,
+    end: Mutex<Option<oneshot::Sender<()>>>,
 }
 
 impl Pursuit {
@@ -153,7 +153,7 @@ impl Pursuit {
         Ok(())
     }
 
-    /// Ends the goal with its result, `None` for an action without one, or with the reason of its failure. A goal of an
+    /// Ends the goal at once, with its result, `None` for an action without one, or with the reason of its failure. A goal of an
     /// action with `decides` that fails before it is accepted is refused with that reason.
     ///
     /// # Errors
@@ -161,13 +161,16 @@ impl Pursuit {
     pub fn end(&self, result: Result<Option<Value>, String>) -> Result<(), Failure> {
         let result = match result {
             Err(reason) => Err(reason),
-            // An empty sequence is no result.
-            Ok(None) => Ok(Term::Sequence(Vec::new())),
-            Ok(Some(value)) => Ok(term(value, "the result")?),
+            Ok(None) => Ok(None),
+            Ok(Some(value)) => Ok(Some(term(value, "the result")?)),
         };
         let end = self.end.lock().take();
         let over = || Failure::new(FailureKind::Closed, "the goal has ended");
-        end.ok_or_else(over)?.send(result).map_err(|_| over())
+        let end = end.filter(|end| !end.is_closed()).ok_or_else(over)?;
+        self.execution.end(result);
+        // The handler returns.
+        let _ = end.send(());
+        Ok(())
     }
 }
 
@@ -212,9 +215,9 @@ pub async fn offered(
     let mut is_stopped = false;
     loop {
         tokio::select! {
-            result = &mut ended => {
-                return result.unwrap_or_else(|_| Err("the program has dropped the goal".to_owned()));
-            }
+            biased;
+            // `Pursuit::end` has given the result.
+            _ = &mut ended => return Err("the program has dropped the goal".to_owned()),
             cause = execution.stopped(), if !is_stopped => {
                 is_stopped = true;
                 // The program may have ended its offer; it still can end the goal.

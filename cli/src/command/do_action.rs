@@ -118,20 +118,30 @@ async fn perform(arguments: &Arguments, config: &Config) -> Result<(), Failure> 
         let robot = arguments.addresses.of(&agent, &arguments.robot).await?;
         let robot = agent.robot(robot);
         let report = |error: &ActionError| failed(error, &arguments.robot, config);
-        let accepted = async {
+        let sent = async {
             let goal = goal(arguments, &robot).await.map_err(|error| match error {
                 GoalError::Usage(text) => {
                     Failure::wrong_usage(text, "the command line", "see `fipa actions ROBOT`")
                 }
                 GoalError::Robot(error) => report(&error),
             })?;
-            robot.send(goal).await.map_err(|error| report(&error))
+            robot.propose(goal).await.map_err(|error| report(&error))
         };
-        let accepted = tokio::select! {
-            accepted = accepted => accepted?,
-            () = stop.requested() => return Err(cancelled(arguments, "before it was accepted")),
+        let early = || cancelled(arguments, "before it was accepted");
+        let mut handle = tokio::select! {
+            sent = sent => sent?,
+            () = stop.requested() => return Err(early()),
         };
-        follow(arguments, accepted, &mut stop, &report).await
+        tokio::select! {
+            accepted = handle.accepted() => accepted.map_err(|error| report(&error))?,
+            () = stop.requested() => {
+                Stop::ending();
+                if handle.cancel(STOP).await.map_err(|error| report(&error))? {
+                    return Err(early());
+                }
+            }
+        }
+        follow(arguments, handle, &mut stop, &report).await
     };
     let done = done.await;
     domain.close().await;
