@@ -7,6 +7,7 @@ drives its robot.
 """
 
 import asyncio
+import contextlib
 import json
 import sys
 
@@ -46,10 +47,20 @@ async def reach(bidder: fipa.Agent, robot: str, place: float) -> float:
     # The bridge refuses a goal without the fence of this lock.
     async with bidder.lock("passage", timeout=60) as lock:
         goal = bidder.invoke(robot, "navigate", {"order": round(10 * place)}, lock=lock)
-        async for progress in goal:
-            if feedback := progress.get("value"):
-                print(f"{robot}: {feedback['sequence'][-1] / 10:.1f} m", flush=True)
-        return float((await goal.result())["sequence"][-1]) / 10
+        try:
+            print(f"{robot} drives:", end="", flush=True)
+            async for progress in goal:
+                if feedback := progress.get("value"):
+                    print(f" {feedback['sequence'][-1] / 10:.1f}", end="", flush=True)
+            return float((await goal.result())["sequence"][-1]) / 10
+        except asyncio.CancelledError:
+            # The dispatcher is gone. The robot stops before the passage is free again.
+            goal.cancel()
+            with contextlib.suppress(fipa.Error):
+                await goal.result()
+            raise
+        finally:
+            print(" m", flush=True)
     # ANCHOR_END: bid
 
 

@@ -2,8 +2,8 @@
 
     python3 navigator.py --ros-args -r __ns:=/crex -p x:=2.0
 
-A real robot offers nav2_msgs/action/NavigateToPose, and publishes a geometry_msgs pose. The types here are those that
-each installation of ROS 2 has: a goal of Fibonacci stands for a place, in decimeters from the begin of the corridor.
+A real robot offers nav2_msgs/action/NavigateToPose, and publishes a pose of geometry_msgs. The types here need no Nav2:
+a goal of Fibonacci stands for a place, in decimeters from the beginning of the corridor.
 """
 
 import time
