@@ -50,4 +50,7 @@ async def main(place: float) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main(float(sys.argv[1])))
+    try:
+        asyncio.run(main(float(sys.argv[1])))
+    except KeyboardInterrupt:
+        pass
