@@ -73,7 +73,8 @@ class Bridge:
         self._robots: dict[str, _Robot] = {}
         self._foreign: list[Any] = []
         self._tasks = robots.Tasks()
-        self._warned: set[tuple[str, str]] = set()
+        #: The mistakes that were told, by kind and name of ROS.
+        self._warned: dict[tuple[str, str], object] = {}
         self._list_at = 0.0
         self._lifecycles = _Lifecycles(ros)
 
@@ -108,6 +109,10 @@ class Bridge:
         """Opens what has appeared, and closes what has gone."""
         present = {(it.kind, it.name): it for it in found}
         for name, robot in list(self._robots.items()):
+            # Its last letters have left since the look before.
+            if not robot.open:
+                del self._robots[name]
+                self._end(robot)
             for key, (known, mapped) in list(robot.open.items()):
                 entity = present.get(key)
                 if entity is not None and entity.types == known.types and entity.servers >= known.servers:
@@ -119,9 +124,6 @@ class Bridge:
                 if robot.requests is not None and key[0] == "services":
                     robot.requests.services.pop(key[1].rsplit("/", 1)[1], None)
                 await mapped.close()
-            if not robot.open:
-                del self._robots[name]
-                self._end(robot)
         for entity in found:
             if not any((entity.kind, entity.name) in robot.open for robot in self._robots.values()):
                 await self._open(entity)
@@ -142,8 +144,9 @@ class Bridge:
             robot = await self._robot(place[0])
             mapped = await self._made(entity, robot, place[1], kind)
         except (UnknownType, fipa.Error) as error:
-            self._warn(entity, f"is not mapped: {error}")
+            self._warn(entity, f"is not mapped: {error}", type(error))
             return
+        self._warned.pop((entity.kind, entity.name), None)
         robot.open[entity.kind, entity.name] = (entity, mapped)
         robot.listed.clear()
         self._list_at = 0.0
@@ -168,6 +171,7 @@ class Bridge:
         if robot is None:
             agent = await self._domain.register(name, type="robot", description="a robot of ROS 2")
             robot = self._robots[name] = _Robot(agent)
+            self._tasks.start(robots.answer_others(agent))
         return robot
 
     def _end(self, robot: _Robot) -> None:
@@ -175,10 +179,11 @@ class Bridge:
             robot.requests.close()
         robot.agent.deregister()
 
-    def _warn(self, entity: Entity, text: str) -> None:
-        """Warns once of each mistake."""
-        if (entity.name, text) not in self._warned and len(self._warned) < 1000:
-            self._warned.add((entity.name, text))
+    def _warn(self, entity: Entity, text: str, mistake: object = None) -> None:
+        """Warns once of a mistake, `mistake` or the text."""
+        key, mistake = (entity.kind, entity.name), mistake or text
+        if self._warned.get(key) != mistake:
+            self._warned[key] = mistake
             _log.warning("%s %s", entity.name, text)
 
     async def _list(self) -> None:

@@ -9,11 +9,10 @@ import uuid
 from collections.abc import Coroutine
 from typing import Any, Protocol
 
-from action_msgs.msg import GoalStatus, GoalStatusArray
+from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
-from rclpy.action.client import ClientGoalHandle
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, qos_profile_action_status_default
+from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
@@ -21,7 +20,7 @@ import fipa
 from fipa import sl
 from fipa.ros2 import describe, graph, types, values
 from fipa.ros2.mapping import Settings
-from fipa.ros2.ros import Full, Inbox, Ros
+from fipa.ros2.ros import MAX_CALLS, Inbox, Ros
 
 _log = logging.getLogger("fipa.ros2")
 
@@ -33,6 +32,9 @@ WAITING = 64
 
 #: Time for the answer of an action server to a goal, in seconds. The client waits ten seconds.
 ANSWER = 5.0
+
+#: Time in which an action server says that it does not know a goal, in seconds.
+UNKNOWN = 2.0
 
 
 def goal_id(client: str | None, goal: str) -> uuid.UUID:
@@ -55,6 +57,9 @@ class Tasks:
 
     def __init__(self) -> None:
         self._running: set[asyncio.Task[None]] = set()
+
+    def __len__(self) -> int:
+        return len(self._running)
 
     def start(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -80,16 +85,8 @@ class Action:
         self._client = ActionClient(ros.node, kind, name)
         self._gone = asyncio.Event()
         self._tasks = Tasks()
-        #: The goals that the server has, by id: also those of an earlier bridge.
-        self._known: dict[bytes, int] = {}
-        self._status = ros.node.create_subscription(
-            GoalStatusArray, f"{name}/_action/status", self._list_goals, qos_profile_action_status_default
-        )
         self.name = name
         self.goals = agent.goals(describe.action(word, kind, settings))
-
-    def _list_goals(self, goals: GoalStatusArray) -> None:
-        self._known = {bytes(it.goal_info.goal_id.uuid): it.status for it in goals.status_list}
 
     async def run(self) -> None:
         async for goal in self.goals:
@@ -99,23 +96,19 @@ class Action:
         self._gone.set()
         await self._tasks.end()
         self.goals.close()
-        await self._ros.call(self._destroy)
-
-    def _destroy(self) -> None:
-        self._ros.node.destroy_subscription(self._status)
-        self._client.destroy()
+        await self._ros.call(self._client.destroy)
 
     async def _pursue(self, goal: fipa.Goal) -> None:
         try:
-            reason = await self._lead(goal)
-        except (values.Mismatch, Full, _Gone) as error:
-            reason = str(error)
-        if reason is not None:
             try:
+                reason = await self._lead(goal)
+            except (values.Mismatch, _Gone) as error:
+                reason = str(error)
+            if reason is not None:
                 goal.fail(reason)
-            except fipa.Error as error:
-                # The time for a stop is over: the client has an outcome.
-                _log.info("a goal of %s has ended before: %s", self.name, error)
+        except fipa.Error as error:
+            # The time for a stop is over: the client has an outcome.
+            _log.info("a goal of %s has ended before: %s", self.name, error)
 
     async def _lead(self, goal: fipa.Goal) -> str | None:
         """Leads a goal to its result. Returns the reason of a failure."""
@@ -133,14 +126,14 @@ class Action:
                 handle = await _unless(gone, asyncio.ensure_future(self._ros.call(sending.begin)), ANSWER)
             except TimeoutError:
                 return "the action server does not answer; it may have died"
-            if not handle.accepted:
-                if bytes(identity.uuid) not in self._known:
-                    return "the action server rejects the goal"
-                # A bridge that has died sent it.
-                accepted = self._kind.Impl.SendGoalService.Response(accepted=True)
-                handle = ClientGoalHandle(self._client, identity, accepted)
-            goal.accept()
             waits.append(result := asyncio.ensure_future(self._ros.call(handle.get_result_async)))
+            if not handle.accepted:
+                # A server rejects a goal that it has: one that a bridge sent which has died. It answers at once if it
+                # does not have the goal.
+                await asyncio.wait({result, gone}, timeout=UNKNOWN, return_when=asyncio.FIRST_COMPLETED)
+                if result.done() and result.result().status == GoalStatus.STATUS_UNKNOWN:
+                    return "the action server rejects the goal"
+            goal.accept()
             await asyncio.wait({result, gone, stopped}, return_when=asyncio.FIRST_COMPLETED)
             if stopped.done() and not result.done():
                 await _unless(gone, asyncio.ensure_future(self._ros.call(handle.cancel_goal_async)))
@@ -246,7 +239,7 @@ class Service:
         except asyncio.CancelledError:
             # ROS has no cancel of a service: its answer is ignored.
             await task.inform("cancelled")
-        except (_Gone, Full) as error:
+        except _Gone as error:
             await task.fail(str(error))
         finally:
             gone.cancel()
@@ -272,7 +265,9 @@ class Requests:
         try:
             word, arguments = read(task.letter)
             service = self.services.get(word)
-            if service is None:
+            if len(self._tasks) > MAX_CALLS:
+                await task.refuse(f"{MAX_CALLS} requests wait already")
+            elif service is None:
                 known = ", ".join(sorted(self.services)) or "none"
                 await task.refuse(f"{word!r} is no service of this agent; its services: {known}")
             else:
@@ -282,6 +277,18 @@ class Requests:
         except fipa.Error as error:
             # The client is gone.
             _log.info("a request has ended: %s", error)
+
+
+async def answer_others(agent: fipa.Agent) -> None:
+    """Answers what begins a conversation that the agent does not lead, until the agent is deregistered."""
+    try:
+        while True:
+            letter = await agent.receive()
+            if letter.performative in ("request", "subscribe", "query-ref", "query-if", "cfp", "propose"):
+                text = f"{agent.name} has no such action, service or topic now"
+                await agent.answer(letter, fipa.Message("not-understood", letter.sender or "", text))
+    except fipa.Error as error:
+        _log.debug("the agent %s has ended: %s", agent.name, error)
 
 
 def read(letter: fipa.Letter) -> tuple[str, dict[str, Any]]:
@@ -349,14 +356,14 @@ def mismatch(ros: Ros, name: str) -> SubscriptionEventCallbacks:
     """Warns once when the policies of a publisher do not fit those of the bridge."""
     warned = False
 
-    def warn(event: Any) -> None:
+    def warn(_event: object) -> None:
         nonlocal warned
         if warned:
             return
         warned = True
         ends = ros.node.get_publishers_info_by_topic(name) + ros.node.get_subscriptions_info_by_topic(name)
         policies = "; ".join(f"{end.node_name}: {_policies(end.qos_profile)}" for end in ends)
-        _log.warning("%s: policies that do not fit (%s): %s", name, event.last_policy_kind, policies)
+        _log.warning("%s: policies that do not fit: %s", name, policies)
 
     return SubscriptionEventCallbacks(incompatible_qos=warn)
 

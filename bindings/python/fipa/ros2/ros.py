@@ -1,6 +1,7 @@
 """The node of the bridge, and the thread in which its callbacks run.
 
-The loop of the agents and the thread of ROS meet in two bounded queues: the calls of `Ros.call`, and `Inbox`.
+The loop of the agents calls functions there with `Ros.call`. The thread calls the loop with `Ros.ask` and `Inbox`, which
+are bounded.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ _log = logging.getLogger("fipa.ros2")
 #: The beginning of the names of nodes of bridges. A bridge does not map what another one offers.
 NODE = "fipa_bridge"
 
-#: Maximum number of calls in each direction that wait. Further ones are refused.
+#: Maximum number of calls that wait: of agents for the services of a robot, and of ROS for agents. Further ones are
+#: refused. The library bounds the goals of agents.
 MAX_CALLS = 256
 
 
@@ -41,7 +43,6 @@ class Ros:
         self.loop = loop
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
-        self._calls = 0
         self._asked = 0
         self._is_closed = False
         self._thread = threading.Thread(target=self._spin, name="ros", daemon=True)
@@ -66,9 +67,7 @@ class Ros:
         rclpy.try_shutdown()
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Calls a function in the thread of ROS. Awaits its result, if that is a future of rclpy. Raises `Full`."""
-        if self._calls >= MAX_CALLS:
-            raise Full(f"{MAX_CALLS} calls wait for ROS already")
+        """Calls a function in the thread of ROS. Awaits its result, if that is a future of rclpy."""
         done: asyncio.Future[Any] = self.loop.create_future()
         awaited: list[Future[Any]] = []
 
@@ -93,15 +92,12 @@ class Ros:
             else:
                 settle(done.set_result, result)
 
-        self._calls += 1
         try:
             self._executor.create_task(run)
             return await done
         except asyncio.CancelledError:
             self._executor.create_task(lambda: [future.cancel() for future in awaited])
             raise
-        finally:
-            self._calls -= 1
 
     async def ask(self, work: Callable[[], Coroutine[Any, Any, Any]]) -> Any:
         """Runs a coroutine in the loop of the agents, for a callback in the thread of ROS. Raises `Full`."""

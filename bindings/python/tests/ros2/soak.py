@@ -74,7 +74,8 @@ class Soak:
                 "canceled": [["started", "canceled"], []],
                 "client killed": [["started", "canceled"], ["started", "succeeded"], ["started", "aborted"], []],
             }.get(kind, [])
-            if has_died and (kind == "gone" or kind == "client killed"):
+            # A goal whose server does not confirm a cancel ends as cancelled after five seconds.
+            if has_died and kind in ("gone", "client killed", "canceled"):
                 allowed = [["started"], ["started", "succeeded"], ["started", "canceled"], ["started", "aborted"], []]
             if log not in allowed:
                 self.wrong.append(f"goal {number}: {kind}; log: {log}; server died: {has_died}")
@@ -99,7 +100,8 @@ def outcome(process: "subprocess.Popen[str]", is_killed: bool) -> str:
         return "succeeded"
     if "has aborted the goal" in errors:
         return "aborted"
-    if any(text in errors for text in ("the server in ROS has died or ended", "it may have died", "no such agent")):
+    gone = ("the server in ROS has died", "it may have died", "no such agent", "unknown action", "is gone: it has left")
+    if any(text in errors for text in gone):
         return "gone"
     return "canceled" if "cancelled" in errors or "canceled" in errors else errors.strip()
 

@@ -70,6 +70,9 @@ class Site:
     def robot(self, namespace: str) -> "Robot":
         return Robot(self, namespace)
 
+    def talker(self, *arguments: str, **options: Any) -> "subprocess.Popen[str]":
+        return self.start(sys.executable, str(HERE / "talker.py"), *arguments, **options)
+
     def bridge(self, mapping: str, *arguments: str, name: str = "bridge") -> "Bridge":
         return Bridge(self, mapping, arguments, name)
 

@@ -115,6 +115,13 @@ class Robots(unittest.TestCase):
             with self.subTest(content), self.assertRaisesRegex(fipa.Refused, reason):
                 self.own.request(fipa.Message("request", "crex", content)).wait(LONG)
 
+    def test_an_unknown_topic_and_another_protocol_are_answered(self) -> None:
+        with self.assertRaisesRegex(fipa.Refused, "no such topic"), self.own.subscribe("crex", "speed") as letters:
+            next(letters)
+        self.own.send(fipa.Message("query-ref", "crex", "(all ?x (is ?x))")).wait(LONG)
+        answer = self.own.receive().wait(LONG)
+        self.assertEqual((answer.performative, answer.sender), ("not-understood", "crex"))
+
     def test_a_text_of_ten_megabytes_comes_back(self) -> None:
         content = json.dumps({"@": "double", "string_value": "x" * 10_000_000})
         letter = self.own.request(fipa.Message("request", "crex", content, language="json")).wait(LONG)
@@ -232,6 +239,48 @@ class Lifetimes(unittest.TestCase):
         self.bridged()
         self.assertEqual(self.bridge.stop(), 0, self.bridge.log.read_text())
         until(lambda: not [it for it in self.domain.agents() if it["name"] == "crex"], "the end of the agent")
+
+
+class Graphs(unittest.TestCase):
+    """What nodes do to the graph of ROS."""
+
+    def setUp(self) -> None:
+        self.site = Site()
+        self.addCleanup(self.site.close)
+        self.bridge = self.site.bridge('topics = ["/crex/*", "/top"]\n')
+
+    def test_a_publisher_of_another_type_takes_the_place(self) -> None:
+        first = self.site.talker("/crex/thing", "std_msgs/String")
+        until(lambda: self.bridge.has_logged("/crex/thing is topic"), "the mapping")
+        self.site.talker("/crex/thing", "std_msgs/Int64")
+        until(lambda: self.bridge.has_logged("/crex/thing has several types"), "the warning")
+        first.terminate()
+        until(lambda: self.bridge.log.read_text().count("/crex/thing is topic") == 2, "the new mapping")
+        with fipa.Domain() as domain:
+            with domain.register("viewer").wait().subscribe("crex", "thing") as letters:
+                self.assertEqual(next(letters).ontology, "std_msgs/msg/Int64")
+
+    def test_policies_that_do_not_fit_are_told_once(self) -> None:
+        self.site.talker("/crex/thing", "std_msgs/String")
+        until(lambda: self.bridge.has_logged("/crex/thing is topic"), "the mapping")
+        self.site.talker("/crex/thing", "std_msgs/String", "best_effort")
+        until(lambda: self.bridge.has_logged("policies that do not fit"), "the warning")
+        self.assertRegex(self.bridge.log.read_text(), ": best_effort, volatile; fipa_bridge: reliable, volatile")
+
+    def test_topics_of_a_lifecycle_node_are_there_while_it_is_active(self) -> None:
+        talker = self.site.talker("/crex/thing", "std_msgs/String", "lifecycle", stdin=subprocess.PIPE)
+        self.addCleanup(talker.stdin.close)
+        # A node that needs no transition is found after the one that does.
+        self.site.talker("/crex/other", "std_msgs/String", "--ros-args", "-r", "__node:=other")
+        until(lambda: self.bridge.has_logged("/crex/other is topic"), "the mapping of the other")
+        self.assertFalse(self.bridge.has_logged("/crex/thing is topic"))
+        for transition, text in (("configure", ""), ("activate", "is topic"), ("deactivate", "has gone")):
+            print(transition, file=talker.stdin, flush=True)
+            until(lambda text=text: not text or self.bridge.has_logged(f"/crex/thing {text}"), transition)
+
+    def test_a_name_without_a_namespace_needs_a_robot(self) -> None:
+        self.site.talker("/top", "std_msgs/String")
+        until(lambda: self.bridge.has_logged('/top has no namespace: set `robot = "NAME"`'), "the warning")
 
 
 class Contents(unittest.TestCase):
