@@ -73,7 +73,7 @@ async def _run(wanted: Mapping | None, config: str | None, name: str, ros_argume
     from fipa.ros2 import graph
     from fipa.ros2.bridge import Bridge
     from fipa.ros2.ros import Ros
-    from fipa.ros2.types import UnknownType
+    from fipa.ros2.values import UnknownType
 
     loop = asyncio.get_running_loop()
     ros = Ros(ros_arguments, loop)

@@ -12,7 +12,7 @@ from rclpy.qos import QoSProfile
 
 import fipa
 from fipa import sl
-from fipa.ros2 import types, values
+from fipa.ros2 import values
 from fipa.ros2.ros import Full, Ros
 
 _log = logging.getLogger("fipa.ros2")
@@ -50,13 +50,14 @@ class AgentAction(Offered):
     def _open(self) -> None:
         #: The goals that the agent has accepted, by the identity of the message of ROS.
         self._accepted: dict[int, tuple[Any, fipa.RemoteGoal]] = {}
+        self._running: dict[bytes, fipa.RemoteGoal] = {}
         self._server = ActionServer(
             self._ros.node,
             self._kind,
             self._name,
             execute_callback=self._execute,
             goal_callback=self._decide,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            cancel_callback=self._cancel,
         )
 
     def close(self) -> None:
@@ -79,17 +80,13 @@ class AgentAction(Offered):
 
     async def _execute(self, handle: Any) -> Any:
         _, goal = self._accepted.pop(id(handle.request))
+        self._running[bytes(handle.goal_id.uuid)] = goal
 
         async def follow() -> Any:
-            cancelling = asyncio.ensure_future(self._cancel(handle, goal))
-            try:
-                async for progress in goal:
-                    if isinstance(value := progress.get("value"), dict):
-                        feedback = values.from_json(self._kind.Feedback, value)
-                        await self._ros.call(handle.publish_feedback, feedback)
-                return values.from_json(self._kind.Result, await goal.result() or {})
-            finally:
-                cancelling.cancel()
+            async for progress in goal:
+                if isinstance(value := progress.get("value"), dict):
+                    await self._ros.call(handle.publish_feedback, values.from_json(self._kind.Feedback, value))
+            return values.from_json(self._kind.Result, await goal.result() or {})
 
         try:
             result = await self._ros.ask(follow)
@@ -100,13 +97,16 @@ class AgentAction(Offered):
             else:
                 handle.abort()
             return self._kind.Result()
+        finally:
+            del self._running[bytes(handle.goal_id.uuid)]
         handle.succeed()
         return result
 
-    async def _cancel(self, handle: Any, goal: fipa.RemoteGoal) -> None:
-        while not handle.is_cancel_requested:
-            await asyncio.sleep(0.05)
+    def _cancel(self, handle: Any) -> CancelResponse:
+        if (goal := self._running.get(bytes(handle.goal_id.uuid))) is None:
+            return CancelResponse.REJECT
         goal.cancel()
+        return CancelResponse.ACCEPT
 
 
 class AgentService(Offered):
@@ -183,7 +183,7 @@ class AgentTopic(Offered):
     def _publish(self, letter: fipa.Letter) -> None:
         with letter:
             if letter.language == "ros2-cdr":
-                if letter.ontology == types.name_of(self._kind):
+                if letter.ontology == values.name_of(self._kind):
                     self._publisher.publish(bytes(letter))
                     return
                 wrong = f"the type is {letter.ontology}"

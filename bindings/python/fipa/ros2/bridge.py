@@ -14,7 +14,7 @@ from fipa.ros2 import agents, graph, robots
 from fipa.ros2.graph import Entity
 from fipa.ros2.mapping import KINDS, Mapping
 from fipa.ros2.ros import Ros
-from fipa.ros2.types import UnknownType, load
+from fipa.ros2.values import UnknownType, load
 
 _log = logging.getLogger("fipa.ros2")
 
@@ -80,14 +80,17 @@ class Bridge:
 
     async def run(self) -> None:
         """Runs until it is cancelled, and ends what it has opened."""
+        loop = asyncio.get_running_loop()
         try:
             await self._offer_agents()
             while True:
+                began = loop.time()
                 found = await self._ros.call(graph.mapped_entities, self._ros.node, self._mapping)
                 inactive = await self._lifecycles.inactive({node for it in found for node in it.lifecycle})
                 await self._follow([it for it in found if inactive.isdisjoint(it.lifecycle)])
                 await self._list()
-                await asyncio.sleep(LOOK)
+                # A look at a large graph takes long.
+                await asyncio.sleep(max(LOOK, 3 * (loop.time() - began)))
         finally:
             await self._close()
 
@@ -108,6 +111,7 @@ class Bridge:
     async def _follow(self, found: list[Entity]) -> None:
         """Opens what has appeared, and closes what has gone."""
         present = {(it.kind, it.name): it for it in found}
+        closing = []
         for name, robot in list(self._robots.items()):
             # Its last letters have left since the look before.
             if not robot.open:
@@ -123,9 +127,11 @@ class Bridge:
                 del robot.open[key]
                 if robot.requests is not None and key[0] == "services":
                     robot.requests.services.pop(key[1].rsplit("/", 1)[1], None)
-                await mapped.close()
+                closing.append(mapped.close())
+        await asyncio.gather(*closing)
+        is_open = {key for robot in self._robots.values() for key in robot.open}
         for entity in found:
-            if not any((entity.kind, entity.name) in robot.open for robot in self._robots.values()):
+            if (entity.kind, entity.name) not in is_open:
                 await self._open(entity)
 
     async def _open(self, entity: Entity) -> None:
@@ -206,9 +212,8 @@ class Bridge:
                 robot.listed.add(key)
 
     async def _close(self) -> None:
+        await asyncio.gather(*(mapped.close() for robot in self._robots.values() for _, mapped in robot.open.values()))
         for robot in self._robots.values():
-            for _, mapped in robot.open.values():
-                await mapped.close()
             self._end(robot)
         for made in self._foreign:
             await self._ros.call(made.close)

@@ -18,7 +18,7 @@ from unique_identifier_msgs.msg import UUID
 
 import fipa
 from fipa import sl
-from fipa.ros2 import describe, graph, types, values
+from fipa.ros2 import describe, graph, values
 from fipa.ros2.mapping import Settings
 from fipa.ros2.ros import MAX_CALLS, Inbox, Ros
 
@@ -211,14 +211,12 @@ class Service:
         self._kind = kind
         self._client = ros.node.create_client(kind, name)
         self._gone = asyncio.Event()
-        self._closed = asyncio.Event()
 
     async def run(self) -> None:
-        await self._closed.wait()
+        await self._gone.wait()
 
     async def close(self) -> None:
         self._gone.set()
-        self._closed.set()
         await self._ros.call(self._ros.node.destroy_client, self._client)
 
     async def answer(self, task: fipa.Task, arguments: dict[str, Any]) -> None:
@@ -319,7 +317,7 @@ class Topic:
         self._publisher = agent.publisher(
             word,
             language="ros2-cdr" if self._is_raw else "json",
-            ontology=types.name_of(kind),
+            ontology=values.name_of(kind),
             latched=profile.depth if is_kept else 0,
         )
         self._subscription = ros.node.create_subscription(

@@ -15,29 +15,50 @@ from __future__ import annotations
 
 import base64
 import binascii
+import functools
+import importlib
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rosidl_parser import definition as idl
 
-from fipa.ros2.types import load
 
 _NUMBERS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _FLOATS = {"float", "double", "long double"}
 _BYTES = {"octet", "uint8"}
 _INTEGERS = {
-    "octet": (0, 2**8 - 1),
-    "char": (0, 2**8 - 1),
-    "uint8": (0, 2**8 - 1),
-    "uint16": (0, 2**16 - 1),
-    "uint32": (0, 2**32 - 1),
-    "uint64": (0, 2**64 - 1),
-    "int8": (-(2**7), 2**7 - 1),
-    "int16": (-(2**15), 2**15 - 1),
-    "int32": (-(2**31), 2**31 - 1),
-    "int64": (-(2**63), 2**63 - 1),
+    **{name: (0, 2**8 - 1) for name in ("octet", "char")},
+    **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32, 64)},
+    **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32, 64)},
 }
+
+
+class UnknownType(LookupError):
+    """A type whose package is not in the environment."""
+
+
+@functools.cache
+def load(name: str) -> Any:
+    """Returns the class of a type: `std_msgs/msg/String`, `test_msgs/action/Fibonacci`. Raises `UnknownType`."""
+    parts = name.split("/")
+    if len(parts) != 3 or not all(part.isidentifier() for part in parts):
+        raise UnknownType(f"{name!r} is no type: expected PACKAGE/msg/NAME, PACKAGE/srv/NAME or PACKAGE/action/NAME")
+    package, kind, word = parts
+    try:
+        return getattr(importlib.import_module(f"{package}.{kind}"), word)
+    except ModuleNotFoundError:
+        raise UnknownType(f"the type {name} is unknown: source the workspace with the package {package}") from None
+    except AttributeError:
+        raise UnknownType(
+            f"the package {package} has no {kind} {word}: source a workspace whose {package} has it"
+        ) from None
+
+
+def name_of(kind: Any) -> str:
+    """The name of a message type: `std_msgs/msg/String`."""
+    package, _, word = kind.__module__.partition(".")
+    return f"{package}/{word.split('.')[0]}/{kind.__name__}"
 
 
 class Mismatch(ValueError):

@@ -9,8 +9,7 @@ from typing import Any
 from test_msgs.msg import Arrays, BasicTypes, BoundedSequences, Constants, Defaults, Empty, MultiNested, Strings, WStrings
 from test_msgs.msg import UnboundedSequences
 
-from fipa.ros2 import types
-from fipa.ros2.values import Mismatch, from_json, to_json
+from fipa.ros2.values import Mismatch, UnknownType, from_json, load, name_of, to_json
 
 
 class Values(unittest.TestCase):
@@ -90,10 +89,10 @@ class Values(unittest.TestCase):
             ("std_msgs/String", "is no type: expected"),
             ("../os/msg/x", "is no type"),
         ):
-            with self.assertRaisesRegex(types.UnknownType, text):
-                types.load(name)
-        self.assertIs(types.load("test_msgs/msg/Empty"), Empty)
-        self.assertEqual(types.name_of(Empty), "test_msgs/msg/Empty")
+            with self.assertRaisesRegex(UnknownType, text):
+                load(name)
+        self.assertIs(load("test_msgs/msg/Empty"), Empty)
+        self.assertEqual(name_of(Empty), "test_msgs/msg/Empty")
 
 
 if __name__ == "__main__":
