@@ -1,5 +1,6 @@
 """Agents for ROS: clients of rclpy, without a word of agents, reach actions, services and topics of agents."""
 
+import subprocess
 import threading
 import time
 import unittest
@@ -7,7 +8,7 @@ import unittest
 import rclpy
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
-from std_msgs.msg import String
+from std_msgs.msg import Float64, String
 from support import LONG, Site, until
 from test_msgs.action import Fibonacci
 from test_msgs.srv import BasicTypes
@@ -21,6 +22,10 @@ count_up = "test_msgs/action/Fibonacci"
 lift = "test_msgs/srv/BasicTypes"
 [agents.arm_1.topics]
 state = "std_msgs/msg/String"
+[agents.sensor.topics]
+depth = "std_msgs/msg/Float64"
+[agents.ear.services]
+tell = "test_msgs/srv/BasicTypes"
 """
 
 
@@ -102,6 +107,20 @@ class Agents(unittest.TestCase):
 
         until(arrives, "the notification")
         self.assertEqual(heard[0], "up")
+
+    def test_the_commands_publish_and_listen_are_agents_for_ros(self) -> None:
+        heard: list[float] = []
+        self.node.create_subscription(Float64, "/sensor/depth", lambda it: heard.append(it.data), 10)
+        self.site.start("fipa", "publish", "sensor", "depth", "(object :data 1.5)", "--rate", "10")
+        listening = self.site.start("fipa", "listen", "ear", "--count", "1", stdout=subprocess.PIPE)
+        until(lambda: rclpy.spin_once(self.node, timeout_sec=0.1) or heard, "the notification")
+        self.assertEqual(heard[0], 1.5)
+        client = self.node.create_client(BasicTypes, "/ear/tell")
+        self.assertTrue(client.wait_for_service(LONG))
+        until(lambda: any(it["name"] == "ear" for it in self.domain.agents()), "the agent")
+        client.call_async(BasicTypes.Request(string_value="hello"))
+        rclpy.spin_once(self.node, timeout_sec=0.1)
+        self.assertIn("(tell ", listening.communicate(timeout=LONG)[0])
 
     def test_a_wrong_notification_is_dropped_with_a_warning(self) -> None:
         self.state.publish(fipa.sl.dumps({"date": "up"})).wait(LONG)
