@@ -35,6 +35,9 @@ const MAX_ERRORS: usize = 16;
 const AGAIN_FIRST: Duration = Duration::from_secs(1);
 const AGAIN_LAST: Duration = Duration::from_secs(30);
 
+/// Minimum time between two attempts to cancel a subscription that the program has dropped.
+const CANCEL_AGAIN: Duration = Duration::from_secs(1);
+
 /// Number of notifications of which the rate is that of a subscription.
 const RATED: usize = 32;
 
@@ -387,6 +390,7 @@ impl Drop for Led {
 /// the agent's queue they would take the place of other letters.
 async fn end(mut dialogue: Dialogue, receivers: Vec<AgentId>, timeout: Duration) {
     loop {
+        let earliest = Instant::now() + CANCEL_AGAIN;
         match dialogue.cancel(receivers.clone(), after(timeout)).await {
             Ok(()) => return,
             Err(error) if is_end(&error) => return log_end(&dialogue, &error),
@@ -394,10 +398,14 @@ async fn end(mut dialogue: Dialogue, receivers: Vec<AgentId>, timeout: Duration)
             // another attempt can succeed.
             Err(error) => log_end(&dialogue, &error),
         }
-        if let Err(error) = dialogue.receive(None).await
-            && is_end(&error)
-        {
-            return log_end(&dialogue, &error);
+        loop {
+            match dialogue.receive(None).await {
+                Err(error) if is_end(&error) => return log_end(&dialogue, &error),
+                // The report on the cancel itself: without this, each attempt would cause the next one at once.
+                Err(DialogueError::Undelivered(_)) => {}
+                _ if Instant::now() < earliest => {}
+                _ => break,
+            }
         }
     }
 }

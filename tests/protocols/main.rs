@@ -316,6 +316,40 @@ async fn a_dropped_subscription_is_cancelled_and_its_notifications_are_discarded
     assert_eq!(text(next_message(&rover).await.unwrap().message()), "hello");
 }
 
+#[test]
+fn a_subscription_that_is_dropped_after_its_publisher_has_gone_keeps_no_thread_busy() {
+    let (done, is_done) = std::sync::mpsc::channel();
+    let test = async move {
+        let (rover, arm) = pair(&[]).await;
+        let initiator = async {
+            let subscribe = to(&rover, Performative::Subscribe, &arm, "pose");
+            rover.subscribe(subscribe, TIMEOUT).await.unwrap()
+        };
+        let participant = async {
+            let first = next_message(&arm).await.unwrap();
+            let mut task = arm.take_part(&first).unwrap();
+            task.agree("").await.unwrap();
+            task
+        };
+        let (poses, task) = tokio::join!(initiator, participant);
+        // Without a last message, as if its process had been killed.
+        arm.deregister().unwrap();
+        drop(poses);
+        // More than the time after which the subscriber learns that the publisher is gone.
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        rover.domain().clone().close().await;
+        drop(task);
+        done.send(()).unwrap();
+    };
+    // A task that never waits would keep the one thread of this runtime.
+    std::thread::spawn(|| {
+        let runtime = tokio::runtime::Builder::new_current_thread();
+        let runtime = { runtime }.enable_all().build().unwrap();
+        runtime.block_on(test);
+    });
+    is_done.recv_timeout(Duration::from_secs(20)).unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_request_is_cancelled() {
     let (rover, arm) = pair(&[]).await;

@@ -72,5 +72,10 @@ async def enter(pending: Pending[Any]) -> Any:
     return value
 
 
+async def itself(value: Any) -> Any:
+    """Enters the block of a value that is there."""
+    return value
+
+
 async def nothing() -> None:
     """The end of the block of a value."""

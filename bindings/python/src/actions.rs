@@ -1,5 +1,6 @@
 //! Actions of robots: offering them, and invoking those of other robots.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 use fipa::AgentId;
@@ -11,6 +12,7 @@ use fipa_bindings::{
 use futures_core::stream::BoxStream;
 use futures_util::StreamExt as _;
 use futures_util::stream::poll_fn;
+use pyo3::types::PyTuple;
 use pyo3::{Bound, Py, PyAny, PyResult, Python, pyclass, pymethods};
 use serde_json::{Map, Value};
 use tokio::sync::{Mutex, Notify, mpsc, watch};
@@ -21,8 +23,11 @@ use crate::events::Events;
 use crate::failure::OrRaise as _;
 use crate::interpreter::call;
 use crate::message::LockArgument;
-use crate::pending::{Output, Pending, begun, seconds, step};
+use crate::pending::{Output, Pending, begun, detached, seconds, step};
 use crate::value::{from_python, to_python};
+
+/// Maximum number of progress reports that a cancelled goal keeps for the iteration. The oldest are dropped.
+const MAX_EARLY: usize = 64;
 
 /// Reads an object of the program.
 fn object(of: &Bound<'_, PyAny>, what: &str) -> PyResult<Map<String, Value>> {
@@ -116,7 +121,14 @@ impl Agent {
 
     /// Invokes an action of a robot. With `timeout` in seconds, the robot stops the goal after that time. The goal
     /// carries the first fence of `lock`.
-    #[pyo3(signature = (robot, action, arguments=None, *, lock=None, timeout=None))]
+    ///
+    /// Each goal has an `id`. One that was sent before, by an agent of this name and with the same id, does not run
+    /// again: both calls get its outcome. So a program sends a goal again if it does not know the outcome.
+    ///
+    /// A goal that is dropped goes on by the rules of its action: by default, the robot cancels it when this agent has
+    /// gone. `with agent.invoke(...) as goal:` or `async with` cancels it at the end of the block.
+    #[pyo3(signature = (robot, action, arguments=None, *, lock=None, timeout=None, id=None))]
+    #[expect(clippy::too_many_arguments, reason = "most have defaults, and names in Python")]
     fn invoke(
         &self,
         py: Python<'_>,
@@ -125,6 +137,7 @@ impl Agent {
         arguments: Option<&Bound<'_, PyAny>>,
         lock: LockArgument,
         timeout: Option<f64>,
+        id: Option<String>,
     ) -> PyResult<RemoteGoal> {
         let agent = self.registered(py)?.clone();
         let robot = AgentId::new(robot).or_fail().or_raise(py)?;
@@ -143,6 +156,8 @@ impl Agent {
                 .read(|lock| lock.fence().map(ToString::to_string))
                 .flatten();
         }
+        let id = id.unwrap_or_else(|| agent.unique_id());
+        goal.id = Some(id.clone());
         let cancel = Arc::<Notify>::default();
         let accepted = watch::Sender::new(false);
         let events = invoke(agent, robot, goal, Arc::clone(&cancel));
@@ -150,8 +165,10 @@ impl Agent {
             led: Arc::new(Mutex::new(Led {
                 events: begun(events),
                 accepted: accepted.clone(),
+                early: VecDeque::new(),
                 end: None,
             })),
+            id,
             accepted,
             cancel,
         })
@@ -256,9 +273,13 @@ impl std::fmt::Debug for Goal {
 
 /// A goal of another robot. Iterate over its progress with `for` or `async for`: dictionaries with `state`, `fraction`,
 /// `note` and `value`.
+///
+/// The end of a block, `with` or `async with`, cancels a goal that has not ended. It does not wait until the robot has
+/// stopped; `result` does, also after the block. A goal that is dropped without a block is not cancelled.
 #[pyclass(frozen, module = "fipa")]
 pub(crate) struct RemoteGoal {
     led: Arc<Mutex<Led>>,
+    id: String,
     accepted: watch::Sender<bool>,
     cancel: Arc<Notify>,
 }
@@ -267,6 +288,8 @@ struct Led {
     events: BoxStream<'static, Result<GoalEvent, Failure>>,
     /// Whether the robot has accepted the goal.
     accepted: watch::Sender<bool>,
+    /// The progress that has arrived after a cancel.
+    early: VecDeque<Value>,
     /// The result, or the failure.
     end: Option<Result<Value, Failure>>,
 }
@@ -275,6 +298,9 @@ impl Led {
     /// Waits for the next progress. Keeps the end.
     async fn next(&mut self) -> Result<Option<Value>, Failure> {
         loop {
+            if let Some(progress) = self.early.pop_front() {
+                return Ok(Some(progress));
+            }
             match &self.end {
                 Some(Ok(_)) => return Ok(None),
                 Some(Err(failure)) => return Err(failure.clone()),
@@ -295,6 +321,18 @@ impl Led {
             self.event().await;
         }
         Ok(())
+    }
+
+    /// Waits for the end, and keeps the progress.
+    async fn ended(&mut self) {
+        while self.end.is_none() {
+            if let Some(progress) = self.event().await {
+                if self.early.len() == MAX_EARLY {
+                    self.early.pop_front();
+                }
+                self.early.push_back(progress);
+            }
+        }
     }
 
     /// Waits for the next event, and returns it if it is a progress.
@@ -323,6 +361,12 @@ impl RemoteGoal {
 
 #[pymethods]
 impl RemoteGoal {
+    /// The id of the goal, to send it again with `Agent.invoke`.
+    #[getter]
+    fn id(&self) -> &str {
+        &self.id
+    }
+
     /// Waits for the result. Raises `Refused` if the robot rejects the goal or fails.
     fn result(&self) -> Pending {
         let led = Arc::clone(&self.led);
@@ -353,9 +397,36 @@ impl RemoteGoal {
         })
     }
 
-    /// Cancels the goal. Its `result` then raises `Cancelled`, unless the robot is done.
+    /// Cancels the goal, unless it has ended. Its `result` then raises `Cancelled`, unless the robot is done.
     fn cancel(&self) {
         self.cancel.notify_one();
+        // The program may never wait for the goal.
+        let led = Arc::clone(&self.led);
+        detached(async move { led.lock().await.ended().await });
+    }
+
+    fn __enter__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    #[pyo3(signature = (*_exception))]
+    fn __exit__(&self, _exception: &Bound<'_, PyTuple>) {
+        self.cancel();
+    }
+
+    fn __aenter__(slf: Bound<'_, Self>) -> PyResult<Py<PyAny>> {
+        let py = slf.py();
+        Ok(call(py, "fipa._loop", "itself", (slf,))?.unbind())
+    }
+
+    #[pyo3(signature = (*_exception))]
+    fn __aexit__(
+        &self,
+        py: Python<'_>,
+        _exception: &Bound<'_, PyTuple>,
+    ) -> PyResult<Py<PyAny>> {
+        self.cancel();
+        Ok(call(py, "fipa._loop", "nothing", ())?.unbind())
     }
 
     fn __iter__(slf: Py<Self>) -> Py<Self> {

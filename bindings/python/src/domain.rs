@@ -135,7 +135,7 @@ impl Domain {
     fn close(&self, py: Python<'_>) -> PyResult<()> {
         let opened = self.opened.get(py)?.clone();
         away(py, || opened.close().wait());
-        log::deliver(py)
+        log::deliver_all(py)
     }
 
     fn __enter__(slf: Py<Self>) -> Py<Self> {

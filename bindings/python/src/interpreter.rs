@@ -10,6 +10,8 @@ use pyo3::call::PyCallArgs;
 use pyo3::types::PyAnyMethods as _;
 use pyo3::{Bound, PyAny, PyResult, Python, pyfunction};
 
+use crate::log;
+
 /// Number of the threads that are in a [section].
 static INSIDE: AtomicUsize = AtomicUsize::new(0);
 
@@ -92,6 +94,8 @@ pub(crate) fn ending(py: Python<'_>) {
     let _ = ENDS.set(current().id());
     py.detach(|| {
         while INSIDE.load(Ordering::SeqCst) > 0 {
+            // Each time: it may have been about to wait.
+            log::wake();
             sleep(Duration::from_millis(1));
         }
     });

@@ -56,6 +56,8 @@ mod _native {
     #[pymodule_export]
     use crate::locks::Owned;
     #[pymodule_export]
+    use crate::log::follow;
+    #[pymodule_export]
     use crate::membership::Membership;
     #[pymodule_export]
     use crate::pending::Pending;

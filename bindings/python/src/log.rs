@@ -1,30 +1,39 @@
 //! The log lines of the library, for the module `logging` of Python.
 //!
-//! No thread of the library calls Python: the lines wait until the program makes its next call.
+//! No thread of the library calls Python. A thread of Python, which [`follow`] keeps, waits for lines and logs them; a
+//! call of the program logs those that wait, too.
 
 use std::collections::VecDeque;
 use std::fmt::{self, Write as _};
 use std::mem::take;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::time::{Duration, Instant};
 
 use fipa_acl::{escape, is_unprintable};
-use parking_lot::Mutex;
+use parking_lot::{Condvar, Mutex};
 use pyo3::types::PyAnyMethods as _;
-use pyo3::{PyResult, Python};
+use pyo3::{PyResult, Python, pyfunction};
 use tracing::field::{Field, Visit};
 use tracing::level_filters::LevelFilter;
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Level, Metadata, Subscriber};
 
-use crate::interpreter::call;
+use crate::interpreter::{away, call, is_ending};
 
 /// Maximum number of lines that wait. The oldest are dropped.
 const MAX_LINES: usize = 256;
 
+/// Maximum time for which the end of a domain waits for lines that another thread logs.
+const MAX_WAIT: Duration = Duration::from_secs(1);
+
 static WAITING: Mutex<Lines> = Mutex::new(Lines {
     lines: VecDeque::new(),
     missed: 0,
+    is_given: false,
 });
+
+/// Notified when lines are added or were logged, and at the end of the interpreter.
+static CHANGED: Condvar = Condvar::new();
 
 /// Whether lines wait, for a check without the lock.
 static HAS_LINES: AtomicBool = AtomicBool::new(false);
@@ -36,6 +45,9 @@ struct Lines {
     lines: VecDeque<Line>,
     /// Number of the lines that were dropped.
     missed: u64,
+    /// Whether a thread logs lines. Others leave theirs to it, so that the order stays, and so does a handler of
+    /// `logging` that calls the library.
+    is_given: bool,
 }
 
 /// Level of Python, name of the logger, text.
@@ -43,7 +55,7 @@ type Line = (u8, String, String);
 
 /// Takes the level of Python's logger, and collects lines from then on.
 pub(crate) fn collect(py: Python<'_>) -> PyResult<()> {
-    let level: i64 = call(py, "fipa._log", "level", ())?.extract()?;
+    let level: i64 = call(py, "fipa._log", "start", ())?.extract()?;
     LEVEL.store((level / 10).clamp(0, 6) as u8, Ordering::Relaxed);
     // A program in Rust that embeds Python may have a collector already.
     let _ = tracing::subscriber::set_global_default(Collector);
@@ -58,11 +70,52 @@ pub(crate) fn deliver(py: Python<'_>) -> PyResult<()> {
     }
     let (lines, missed) = {
         let mut waiting = WAITING.lock();
+        if waiting.is_given {
+            return Ok(());
+        }
         HAS_LINES.store(false, Ordering::Relaxed);
+        waiting.is_given = true;
         (take(&mut waiting.lines), take(&mut waiting.missed))
     };
-    call(py, "fipa._log", "emit", (Vec::from(lines), missed))?;
-    Ok(())
+    let logged = call(py, "fipa._log", "emit", (Vec::from(lines), missed));
+    WAITING.lock().is_given = false;
+    CHANGED.notify_all();
+    logged.map(drop)
+}
+
+/// Gives the lines that wait to Python, and waits for those that another thread logs.
+pub(crate) fn deliver_all(py: Python<'_>) -> PyResult<()> {
+    away(py, || {
+        let due = Instant::now() + MAX_WAIT;
+        let mut waiting = WAITING.lock();
+        while waiting.is_given && !CHANGED.wait_until(&mut waiting, due).timed_out() {}
+    });
+    deliver(py)
+}
+
+/// Logs the lines at once, until the interpreter ends: the work of a thread of Python.
+#[pyfunction]
+#[pyo3(name = "_follow_log")]
+pub(crate) fn follow(py: Python<'_>) {
+    loop {
+        away(py, || {
+            let mut waiting = WAITING.lock();
+            while (waiting.lines.is_empty() || waiting.is_given) && !is_ending() {
+                CHANGED.wait(&mut waiting);
+            }
+        });
+        if is_ending() {
+            return;
+        }
+        if let Err(error) = deliver(py) {
+            error.write_unraisable(py, None);
+        }
+    }
+}
+
+/// Wakes the thread of [`follow`] at the end of the interpreter.
+pub(crate) fn wake() {
+    CHANGED.notify_all();
 }
 
 /// Collects the events of all threads.
@@ -108,6 +161,8 @@ impl Subscriber for Collector {
         }
         waiting.lines.push_back(line);
         HAS_LINES.store(true, Ordering::Relaxed);
+        drop(waiting);
+        CHANGED.notify_all();
     }
 
     fn new_span(&self, _: &Attributes<'_>) -> Id {

@@ -163,6 +163,21 @@ pub(crate) fn begun<T: Send + 'static>(
     }
 }
 
+/// Has a future go on without the program. Its first part is done before the return.
+pub(crate) fn detached(future: impl Future<Output = ()> + Send + 'static) {
+    let mut future = Box::pin(future);
+    let mut context = Context::from_waker(Waker::noop());
+    let first = async {
+        if poll_fn(|_| Poll::Ready(future.as_mut().poll(&mut context)))
+            .await
+            .is_pending()
+        {
+            tokio::spawn(future);
+        }
+    };
+    first.wait();
+}
+
 fn used() -> PyErr {
     PyRuntimeError::new_err("the value is awaited, or was awaited, elsewhere")
 }

@@ -3,6 +3,8 @@
 import array
 import gc
 import json
+import signal
+import time
 import unittest
 from datetime import datetime, timedelta, timezone
 
@@ -280,9 +282,57 @@ class Logging(unittest.TestCase):
             logs.output,
             [
                 "WARNING:fipa.mts.core:{is not a format} %s",
-                "WARNING:fipa:2 older lines were dropped: the program made no call for too long",
+                "WARNING:fipa:2 older lines were dropped: there were too many at once",
             ],
         )
+
+    def test_a_program_that_only_waits_logs_at_once(self) -> None:
+        waits = ["time.sleep(60)", "asyncio.run(asyncio.sleep(60))", "asyncio.run(receive())"]
+        for number, wait in enumerate(waits):
+            with self.subTest(wait):
+                other = program(
+                    f"""
+                    import logging
+                    logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
+                    domain = fipa.Domain()
+                    agent = domain.register("waits_{number}").wait()
+                    async def receive():
+                        await asyncio.wait_for(agent.receive(), 60)
+                    print("ready", flush=True)
+                    {wait}
+                    """
+                )
+                lines = iter(other.stdout.readline, "")
+                self.assertTrue(any(line == "ready\n" for line in lines))
+                began = time.monotonic()
+                with fipa.Domain() as domain, domain.register(f"late_{number}").wait():
+                    self.assertTrue(any(line.startswith(f"joined name=late_{number} ") for line in lines))
+                self.assertLess(time.monotonic() - began, 30)
+                other.send_signal(signal.SIGINT)
+                other.communicate(timeout=60)
+
+    def test_a_handler_that_calls_the_library_gets_each_line_once(self) -> None:
+        other = program(
+            """
+            import logging
+            domain = fipa.Domain()
+            agent = domain.register("logger").wait()
+
+            class Sender(logging.Handler):
+                def emit(self, record):
+                    if "name=logged_" in record.getMessage():
+                        agent.send(fipa.Message("inform", "logger", record.getMessage()))
+
+            logging.getLogger().addHandler(Sender())
+            logging.getLogger().setLevel(logging.INFO)
+            second = fipa.Domain()
+            agents = [second.register(f"logged_{number}").wait() for number in range(5)]
+            for number in range(5):
+                assert agent.receive().wait(timeout=60).text.startswith(f"joined name=logged_{number} ")
+            print("all")
+            """
+        )
+        self.assertEqual(finished(self, other), "all\n")
 
 
 class Crash(Case):

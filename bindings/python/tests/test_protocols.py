@@ -290,6 +290,74 @@ class Actions(Loops):
             with self.assertRaises(fipa.Cancelled):
                 await accepted
 
+    async def test_a_goal_that_is_sent_again_with_its_id_runs_once(self) -> None:
+        with self.arm.goals({"name": "reach", "result": "integer"}) as goals:
+            first = self.rover.invoke(self.arm.name, "reach", {}, id="reach-17")
+            goal = await goals.next()
+            self.assertEqual((first.id, goal.id), ("reach-17", "reach-17"))
+            again = self.rover.invoke(self.arm.name, "reach", {}, id=first.id)
+            await again.accepted()
+            goal.succeed(3)
+            self.assertEqual([await first.result(), await again.result()], [3, 3])
+            # After its end, too.
+            self.assertEqual(await self.rover.invoke(self.arm.name, "reach", {}, id="reach-17").result(), 3)
+            other = self.rover.invoke(self.arm.name, "reach", {})
+            goal = await goals.next()
+            self.assertEqual(goal.id, other.id)
+            goal.succeed(4)
+            self.assertEqual(await other.result(), 4)
+
+    async def test_the_end_of_a_block_cancels_a_goal(self) -> None:
+        with self.arm.goals({"name": "reach", "client_gone": "continue"}) as goals:
+            with self.assertRaisesRegex(ValueError, "mine"):
+                async with self.rover.invoke(self.arm.name, "reach", {}) as sent:
+                    goal = await goals.next()
+                    await sent.accepted()
+                    raise ValueError("mine")
+            await goal.stopped()
+            self.assertEqual(goal.stop_reason, "the goal was cancelled")
+            goal.fail(goal.stop_reason)
+            with self.assertRaises(fipa.Cancelled):
+                await sent.result()
+
+            # Without a wait for the outcome.
+            with self.rover.invoke(self.arm.name, "reach", {}):
+                goal = await goals.next()
+            await goal.stopped()
+            goal.fail("stopped")
+
+            with self.rover.invoke(self.arm.name, "reach", {}) as sent:
+                (await goals.next()).succeed(3)
+                self.assertEqual(await sent.result(), 3)
+            self.assertEqual(await sent.result(), 3)
+
+    async def test_a_goal_that_is_dropped_goes_on(self) -> None:
+        with self.arm.goals({"name": "reach", "client_gone": "continue"}) as goals:
+            sent = self.rover.invoke(self.arm.name, "reach", {}, id="dropped")
+            goal = await goals.next()
+            await sent.accepted()
+            del sent
+            await asyncio.sleep(0.3)
+            self.assertIsNone(goal.stop_reason)
+            goal.succeed(3)
+            self.assertEqual(await self.rover.invoke(self.arm.name, "reach", {}, id="dropped").result(), 3)
+
+    async def test_the_progress_of_a_cancelled_goal_arrives(self) -> None:
+        with self.arm.goals({"name": "reach"}) as goals:
+            sent = self.rover.invoke(self.arm.name, "reach", {})
+            goal = await goals.next()
+            await sent.accepted()
+            sent.cancel()
+            await goal.stopped()
+            goal.progress(0.5, "stops")
+            await asyncio.sleep(0.3)
+            goal.fail("stopped")
+            notes = []
+            with self.assertRaises(fipa.Cancelled):
+                async for progress in sent:
+                    notes.append(progress["note"])
+            self.assertIn("stops", notes)
+
     async def test_goals_need_the_fence_of_a_lock_and_a_wrong_option_is_named(self) -> None:
         fenced = {"name": "lift", "fenced_by": {"owner": self.arm.name, "resource": "bay"}, "client_gone": "continue"}
         with self.arm.goals(fenced):
