@@ -194,8 +194,8 @@ fn serve() {
         &[
             "lift 2.5: agreed true",
             "lift 2.5: \"lifted 2.5 kg\"",
-            "lift 400: the other side refused: (refuse :sender arm_1…",
-            "lift a crate: the other side refused: (refuse :sender arm_1…",
+            "lift 400: the other side refused: too heavy",
+            "lift a crate: the other side refused: the content is no weight",
         ],
     );
 }

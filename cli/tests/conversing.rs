@@ -195,7 +195,7 @@ fn request_prints_the_agreement_and_the_result() {
 
     let error = host.run(&["request", "arm_1", "refuse"]).failed(1);
     assert!(
-        error.starts_with("error: the other side refused: (refuse "),
+        error.starts_with("error: the other side refused: too heavy (refuse "),
         "{error}"
     );
     assert!(error.contains("too heavy"), "{error}");

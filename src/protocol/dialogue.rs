@@ -27,18 +27,21 @@ use crate::error::{ReceiveError, SendError};
 /// Maximum number of `reply-to` names of a participant that are followed.
 const MAX_DELEGATES: usize = 16;
 
+/// Maximum number of characters of the reason of another agent in the text of an error.
+const MAX_REASON: usize = 500;
+
 /// The error of a conversation.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum DialogueError {
     /// The other side refused. Holds its `refuse`.
-    #[error("the other side refused: {0}")]
+    #[error("the other side refused: {}", Reason(.0))]
     Refused(Box<Message>),
     /// The other side failed. Holds its `failure`.
-    #[error("the other side failed: {0}")]
+    #[error("the other side failed: {}", Reason(.0))]
     Failed(Box<Message>),
     /// The other side did not understand a message. Holds its `not-understood`.
-    #[error("the other side did not understand a message: {0}")]
+    #[error("the other side did not understand a message: {}", Reason(.0))]
     NotUnderstood(Box<Message>),
     /// The initiator cancelled the conversation. Holds its `cancel`, and on the initiator's side the
     /// confirmation.
@@ -120,6 +123,38 @@ pub enum DialogueError {
     /// No message can be received.
     #[error(transparent)]
     Receive(ReceiveError),
+}
+
+/// The reason in the last message of the other side: its content if that is a text, else the message.
+struct Reason<'a>(&'a Message);
+
+impl fmt::Display for Reason<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let content = self.0.content().map_or(&[][..], |content| content);
+        // A copy, because another process may change shared memory after the check for UTF-8. One more character than
+        // is shown tells whether there are more.
+        let start = content.get(..4 * (MAX_REASON + 1)).unwrap_or(content);
+        let start = start.to_vec();
+        let text = match std::str::from_utf8(&start) {
+            Ok(text) => text,
+            // The cut is within a character.
+            Err(error) if error.error_len().is_none() && start.len() < content.len() => {
+                let valid = start.get(..error.valid_up_to()).unwrap_or_default();
+                std::str::from_utf8(valid).unwrap_or_default()
+            }
+            Err(_) => return self.0.fmt(f),
+        };
+        if text.trim().is_empty() {
+            return self.0.fmt(f);
+        }
+        match text.char_indices().nth(MAX_REASON) {
+            None => f.write_str(&escape(text)),
+            Some((end, _)) => {
+                let shown = text.get(..end).unwrap_or_default();
+                write!(f, "{}… ({} bytes)", escape(shown), content.len())
+            }
+        }
+    }
 }
 
 /// A received message and its meaning for the conversation.
@@ -870,4 +905,34 @@ fn listed(names: &[String]) -> String {
         .map(|name| escape_name(name))
         .collect();
     format!("{}{more}", shown.join(", "))
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_acl::Message;
+
+    use super::*;
+
+    fn refusal(content: &[u8]) -> String {
+        let refuse = Message::builder(Performative::Refuse);
+        let refuse = refuse.content(content.to_vec()).build().unwrap();
+        DialogueError::Refused(Box::new(refuse)).to_string()
+    }
+
+    #[test]
+    fn the_text_of_an_error_is_the_reason_of_the_other_side() {
+        let text = |reason: &str| format!("the other side refused: {reason}");
+        assert_eq!(refusal(b"too heavy"), text("too heavy"));
+        assert_eq!(refusal(b"a\x1b[2Jb"), text("a\\u{1b}[2Jb"));
+        let long = text(&format!("{}… (3000 bytes)", "谢".repeat(500)));
+        assert_eq!(refusal("谢".repeat(1_000).as_bytes()), long);
+        assert_eq!(
+            refusal("🤖".repeat(500).as_bytes()),
+            text(&"🤖".repeat(500))
+        );
+        for no_text in [&b""[..], b" \n", b"\xff\xfe"] {
+            let shown = refusal(no_text);
+            assert!(shown.starts_with(&text("(refuse")), "{shown}");
+        }
+    }
 }

@@ -26,6 +26,7 @@ __all__ = [
     "Domain",
     "Events",
     "_ending",
+    "_follow_log",
     "_forked",
     "Letter",
     "Lock",

@@ -128,7 +128,10 @@ impl Agent {
     /// A goal that is dropped goes on by the rules of its action: by default, the robot cancels it when this agent has
     /// gone. `with agent.invoke(...) as goal:` or `async with` cancels it at the end of the block.
     #[pyo3(signature = (robot, action, arguments=None, *, lock=None, timeout=None, id=None))]
-    #[expect(clippy::too_many_arguments, reason = "most have defaults, and names in Python")]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "most have defaults, and names in Python"
+    )]
     fn invoke(
         &self,
         py: Python<'_>,
@@ -420,11 +423,7 @@ impl RemoteGoal {
     }
 
     #[pyo3(signature = (*_exception))]
-    fn __aexit__(
-        &self,
-        py: Python<'_>,
-        _exception: &Bound<'_, PyTuple>,
-    ) -> PyResult<Py<PyAny>> {
+    fn __aexit__(&self, py: Python<'_>, _exception: &Bound<'_, PyTuple>) -> PyResult<Py<PyAny>> {
         self.cancel();
         Ok(call(py, "fipa._loop", "nothing", ())?.unbind())
     }

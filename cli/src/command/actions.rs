@@ -269,7 +269,7 @@ fn policy(policy: Policy) -> String {
     match policy {
         Policy::Queue(longest) => format!("up to {longest} goals wait"),
         Policy::Preempt => "a new goal takes its place".to_owned(),
-        _ => "a new goal is refused".to_owned(),
+        _ => "a goal beyond those that may run at once is refused".to_owned(),
     }
 }
 

@@ -291,7 +291,7 @@ pub(super) fn failed(error: &DialogueError, name: &AgentId) -> Failure {
     Failure::failed(in_full(error), format!("{:?}", name.name()), help)
 }
 
-/// Formats the error with its whole message, which has the reason of the other agent or platform.
+/// Formats the error with the reason of the other agent or platform, and then with its whole message.
 pub(super) fn in_full(error: &DialogueError) -> String {
     let text = ErrorChain(error).to_string();
     let message = match error {
@@ -303,7 +303,11 @@ pub(super) fn in_full(error: &DialogueError) -> String {
         | DialogueError::Unexpected(message) => message,
         _ => return text,
     };
-    text.replacen(&message.to_string(), &format!("{message:#}"), 1)
+    let short = message.to_string();
+    match text.contains(&short) {
+        true => text.replacen(&short, &format!("{message:#}"), 1),
+        false => format!("{text} {message:#}"),
+    }
 }
 
 /// Formats a message of another agent: with its whole texts if it has a reason.
