@@ -5,37 +5,31 @@ use std::env;
 use std::path::Path;
 use std::process::Command;
 
-use fipa_testbed::languages::{bindings, install_package, libraries};
+use fipa_testbed::languages::{bindings, install_package, ros2_pythons};
 
 /// Runs the tests of a file with each release.
 fn run(tests: &str) {
-    let in_ci = env::var("CI").as_deref() == Ok("true");
-    let releases = env::var("FIPA_ROS2").unwrap_or_default();
-    let is_built = libraries().join("libfipa_python.so").exists();
-    if releases.is_empty() || !is_built {
-        let remedy = "run `.ci/ros2` and `cargo build -p fipa-python` first";
-        assert!(!in_ci, "{tests}: {remedy}");
-        eprintln!("SKIPPED, not a success: {tests} needs rclpy; {remedy}");
-        return;
-    }
-    let package = tempfile::tempdir().unwrap();
-    install_package(package.path());
-    let command = Path::new(env!("CARGO_BIN_EXE_fipa")).parent().unwrap();
+    let command = Path::new(env!("CARGO_BIN_EXE_fipa"))
+        .parent()
+        .expect("a folder");
     let path = env::join_paths(
         [command.to_owned()]
             .into_iter()
             .chain(env::split_paths(&env::var_os("PATH").unwrap_or_default())),
-    );
-    for python in releases.split(':') {
-        let output = Command::new(python)
+    )
+    .expect("a path");
+    for python in ros2_pythons(tests) {
+        let package = tempfile::tempdir().expect("a directory");
+        install_package(package.path());
+        let output = Command::new(&python)
             .args(["-X", "faulthandler", "-m", "unittest", "-v", tests])
             .current_dir(bindings("python/tests/ros2"))
             .env("PYTHONPATH", package.path())
             .env("PYTHONDONTWRITEBYTECODE", "1")
-            .env("PATH", path.as_ref().unwrap())
+            .env("PATH", &path)
             .env("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
             .output()
-            .unwrap();
+            .expect("python runs");
         let text = String::from_utf8_lossy(&output.stderr);
         assert!(
             output.status.success(),

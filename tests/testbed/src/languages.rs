@@ -95,6 +95,28 @@ fn copy_sources(from: &Path, to: &Path) {
     }
 }
 
+/// Returns the Pythons with a rclpy of ROS 2, one for each release, that the environment variable `FIPA_ROS2` names with
+/// colons between them. If the test `name` cannot run, prints a note, or panics if `CI=true`.
+///
+/// # Panics
+/// If the test cannot run and `CI=true`.
+#[must_use]
+pub fn ros2_pythons(name: &str) -> Vec<String> {
+    let named = std::env::var("FIPA_ROS2").unwrap_or_default();
+    let pythons: Vec<String> = named.split_terminator(':').map(str::to_owned).collect();
+    let mut missing = Vec::new();
+    if pythons.is_empty() {
+        missing.push("rclpy: `export FIPA_ROS2=$(.ci/ros2)`");
+    }
+    if !libraries().join("libfipa_python.so").exists() {
+        missing.push("the module for Python: `cargo build -p fipa-python`");
+    }
+    match is_complete(name, &missing) {
+        true => pythons,
+        false => Vec::new(),
+    }
+}
+
 /// Puts the package `fipa` for Python into a directory, with the module that cargo has built.
 pub fn install_package(into: &Path) {
     let to = into.join("fipa");

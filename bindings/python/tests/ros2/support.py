@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -35,6 +36,19 @@ def until(happened: Callable[[], Any], what: str) -> Any:
     return result
 
 
+def ros_domain() -> tuple[int, socket.socket]:
+    """Returns a domain of ROS that no other test has until the socket is closed."""
+    # Above 101, the ports of Fast DDS are those that the system gives to clients.
+    for number in range(1, 102):
+        place = socket.socket(socket.AF_UNIX)
+        try:
+            place.bind(f"\0fipa-test-ros-domain-{number}")
+            return number, place
+        except OSError:
+            place.close()
+    raise AssertionError("no domain of ROS is free")
+
+
 class Site:
     """A domain of agents and a graph of ROS of its own."""
 
@@ -43,12 +57,11 @@ class Site:
         self.path = Path(self._directory.name)
         self.config = self.path / "fipa.toml"
         self.config.write_text(f'domain = "ros2-{os.getpid()}"\nruntime_dir = "{self.path}/run"\n' + _CONFIGURATION)
-        # Above 101, the ports of Fast DDS are those that the system gives to clients.
-        number = str(os.getpid() % 100 + 1)
+        number, self._place = ros_domain()
         self.environment = {
             **os.environ,
             "FIPA_CONFIG": str(self.config),
-            "ROS_DOMAIN_ID": number,
+            "ROS_DOMAIN_ID": str(number),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "ROS_LOG_DIR": str(self.path / "log"),
         }
@@ -61,6 +74,7 @@ class Site:
         # A process that joins removes what killed ones have left.
         fipa.Domain(self.config).close()
         self._directory.cleanup()
+        self._place.close()
 
     def start(self, *command: str, **options: Any) -> "subprocess.Popen[str]":
         process = subprocess.Popen(command, env=self.environment, text=True, **options)
