@@ -5,15 +5,18 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.qos import QoSProfile
 
 import fipa
 from fipa import sl
 from fipa.ros2 import values
-from fipa.ros2.ros import Full, Ros
+from fipa.ros2.ros import Ros
 
 _log = logging.getLogger("fipa.ros2")
 
@@ -22,6 +25,16 @@ LONGEST_PAUSE = 5.0
 
 #: Depth of the queue of a publisher.
 DEPTH = 10
+
+#: Time for the answer of an agent to a request of ROS, in seconds.
+REQUEST = 60.0
+
+#: Maximum number of calls of ROS that wait for the same action or service of an agent. Further ones are refused.
+MAX_CALLS = 256
+
+
+class Full(Exception):
+    """Too many calls wait already."""
 
 
 class Offered:
@@ -35,7 +48,20 @@ class Offered:
         self._word = word
         self._kind = kind
         self._name = f"/{agent}/{word}"
+        #: One call that waits must not stop the others.
+        self._group = ReentrantCallbackGroup()
+        self._waiting = 0
         self._open()
+
+    async def _ask(self, work: Callable[[], Coroutine[Any, Any, Any]]) -> Any:
+        """Runs a coroutine in the loop of the agents. Raises `Full`."""
+        if self._waiting >= MAX_CALLS:
+            raise Full(f"{MAX_CALLS} calls wait already")
+        self._waiting += 1
+        try:
+            return await self._ros.ask(work)
+        finally:
+            self._waiting -= 1
 
     def _open(self) -> None:
         raise NotImplementedError
@@ -58,6 +84,7 @@ class AgentAction(Offered):
             execute_callback=self._execute,
             goal_callback=self._decide,
             cancel_callback=self._cancel,
+            callback_group=self._group,
         )
 
     def close(self) -> None:
@@ -70,8 +97,8 @@ class AgentAction(Offered):
             return goal
 
         try:
-            goal = await self._ros.ask(invoke)
-        except (fipa.Error, Full) as error:
+            goal = await self._ask(invoke)
+        except (fipa.Error, Full, ValueError) as error:
             # ROS has no reason for a rejected goal.
             _log.warning("%s: a goal is rejected: %s", self._name, error)
             return GoalResponse.REJECT
@@ -89,8 +116,8 @@ class AgentAction(Offered):
             return values.from_json(self._kind.Result, await goal.result() or {})
 
         try:
-            result = await self._ros.ask(follow)
-        except (fipa.Error, values.Mismatch, Full) as error:
+            result = await self._ask(follow)
+        except (fipa.Error, Full, ValueError) as error:
             _log.warning("%s: %s", self._name, error)
             if handle.is_cancel_requested:
                 handle.canceled()
@@ -113,7 +140,9 @@ class AgentService(Offered):
     """The requests of an agent, as a service of ROS."""
 
     def _open(self) -> None:
-        self._service = self._ros.node.create_service(self._kind, self._name, self._answer)
+        self._service = self._ros.node.create_service(
+            self._kind, self._name, self._answer, callback_group=self._group
+        )
         self._send = self._service.send_response
         # ROS has no failure of a service: a request that fails has no answer, so that no client takes it for a success.
         self._service.send_response = self._send_if_any
@@ -128,7 +157,8 @@ class AgentService(Offered):
     async def _answer(self, message: Any, _response: Any) -> Any:
         async def request() -> Any:
             content = sl.dumps({"@": self._word, **values.to_json(message)})
-            letter = await self._own.request(fipa.Message("request", self._agent, content, language="fipa-sl"))
+            asked = fipa.Message("request", self._agent, content, language="fipa-sl")
+            letter = await self._own.request(asked, timeout=REQUEST)
             text = letter.text
             answer = json.loads(text) if letter.language == "json" else sl.loads(text) if text else {}
             if isinstance(answer, dict):
@@ -136,8 +166,8 @@ class AgentService(Offered):
             return values.from_json(self._kind.Response, answer)
 
         try:
-            return await self._ros.ask(request)
-        except (fipa.Error, values.Mismatch, Full) as error:
+            return await self._ask(request)
+        except (fipa.Error, Full, ValueError, RecursionError) as error:
             reason = str(error)
         _log.warning("%s: no answer: %s", self._name, reason)
         response = self._kind.Response()
@@ -152,13 +182,25 @@ class AgentTopic(Offered):
     """A topic of an agent, as a topic of ROS."""
 
     def _open(self) -> None:
-        self._publisher = self._ros.node.create_publisher(self._kind, self._name, QoSProfile(depth=DEPTH))
+        events = PublisherEventCallbacks(incompatible_qos=self._warn_once)
+        profile = QoSProfile(depth=DEPTH)
+        self._publisher = self._ros.node.create_publisher(self._kind, self._name, profile, event_callbacks=events)
+        self._has_warned = False
+        self._dropped = 0
         self._task: asyncio.Task[None] | None = None
         self._ros.soon(self._begin)
 
     def close(self) -> None:
         self._ros.soon(self._end)
         self._ros.node.destroy_publisher(self._publisher)
+
+    def _warn_once(self, _event: object) -> None:
+        """Tells the policies of a subscription that do not fit those of the publisher."""
+        if not self._has_warned:
+            self._has_warned = True
+            ends = self._ros.node.get_subscriptions_info_by_topic(self._name)
+            policies = "; ".join(f"{end.node_name}: {_policies(end.qos_profile)}" for end in ends)
+            _log.warning("%s: reliable, volatile; policies that do not fit: %s", self._name, policies)
 
     def _begin(self) -> None:
         self._task = asyncio.get_running_loop().create_task(self._follow())
@@ -177,6 +219,8 @@ class AgentTopic(Offered):
                         self._publish(letter)
             except fipa.Error as error:
                 _log.info("%s: %s; next attempt in %.0f s", self._name, error, pause)
+            except Exception:
+                _log.exception("%s: the subscription has failed; next attempt in %.0f s", self._name, pause)
             await asyncio.sleep(pause)
             pause = min(pause * 2, LONGEST_PAUSE)
 
@@ -186,15 +230,22 @@ class AgentTopic(Offered):
                 if letter.ontology == values.name_of(self._kind):
                     self._publisher.publish(bytes(letter))
                     return
-                wrong = f"the type is {letter.ontology}"
+                wrong = f"the type is {letter.ontology!r}"
             else:
                 try:
                     value = json.loads(letter.text) if letter.language == "json" else sl.loads(letter.text)
                     self._publisher.publish(values.from_json(self._kind, value))
                     return
-                except ValueError as error:
+                except (ValueError, RecursionError, fipa.Error) as error:
                     wrong = str(error)
-        _log.warning("%s: a notification is dropped: %s", self._name, wrong)
+        self._dropped += 1
+        # At the first, second, fourth, eighth.
+        if self._dropped & (self._dropped - 1) == 0:
+            _log.warning("%s: %d notifications are dropped, the last because: %s", self._name, self._dropped, wrong)
+
+
+def _policies(profile: Any) -> str:
+    return f"{profile.reliability.name.lower()}, {profile.durability.name.lower()}"
 
 
 #: What agents offer, by kind, as in the mapping.

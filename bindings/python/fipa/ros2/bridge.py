@@ -42,15 +42,17 @@ class _Lifecycles:
     def __init__(self, ros: Ros) -> None:
         self._ros = ros
         self._clients: dict[str, Any] = {}
+        self._active: set[str] = set()
 
     async def inactive(self, nodes: set[str]) -> set[str]:
-        """Returns those of the nodes that are not active, or do not answer."""
+        """Returns those of the nodes that are not active. One that does not answer in time is as it was."""
         for node in set(self._clients) - nodes:
             await self._ros.call(self._ros.node.destroy_client, self._clients.pop(node))
-        active = await asyncio.gather(*(self._is_active(node) for node in nodes))
-        return {node for node, is_active in zip(nodes, active, strict=True) if not is_active}
+        self._active &= nodes
+        await asyncio.gather(*(self._look(node) for node in nodes))
+        return nodes - self._active
 
-    async def _is_active(self, node: str) -> bool:
+    async def _look(self, node: str) -> None:
         if node not in self._clients:
             create = self._ros.node.create_client
             self._clients[node] = await self._ros.call(create, GetState, f"{node}/get_state")
@@ -58,8 +60,11 @@ class _Lifecycles:
             asked = self._ros.call(self._clients[node].call_async, GetState.Request())
             answer = await asyncio.wait_for(asked, LOOK)
         except asyncio.TimeoutError:
-            return False
-        return bool(answer.current_state.id == State.PRIMARY_STATE_ACTIVE)
+            return
+        if answer.current_state.id == State.PRIMARY_STATE_ACTIVE:
+            self._active.add(node)
+        else:
+            self._active.discard(node)
 
 
 class Bridge:
@@ -119,11 +124,10 @@ class Bridge:
                 self._end(robot)
             for key, (known, mapped) in list(robot.open.items()):
                 entity = present.get(key)
-                if entity is not None and entity.types == known.types and entity.servers >= known.servers:
+                if entity is not None and entity.follows(known):
                     robot.open[key] = (entity, mapped)
                     continue
-                has_changed = entity is not None and entity.types != known.types
-                _log.info("%s %s", key[1], "has changed its type" if has_changed else "has gone")
+                _log.info("%s has %s", key[1], "gone" if entity is None else "changed")
                 del robot.open[key]
                 if robot.requests is not None and key[0] == "services":
                     robot.requests.services.pop(key[1].rsplit("/", 1)[1], None)
@@ -138,12 +142,21 @@ class Bridge:
         if len(entity.types) > 1:
             self._warn(entity, f"has several types: {', '.join(entity.types)}")
             return
+        if entity.is_looped:
+            self._warn(entity, "is published by a bridge, too: its messages would go round")
+            return
         if len(entity.servers) > 1:
             self._warn(entity, f"has {len(entity.servers)} servers; one is expected")
             return
         place = self._mapping.agent_of(entity.name)
         if place is None:
             self._warn(entity, 'has no namespace: set `robot = "NAME"` in the mapping')
+            return
+        if place[0] in ("df", "ams"):
+            self._warn(entity, f"has a namespace that is the name of an agent of the platform: {place[0]}")
+            return
+        if entity.kind == "services" and place[1] in self._services_of(place[0]):
+            self._warn(entity, f"is not mapped: {place[0]} has a service {place[1]} already")
             return
         try:
             kind = load(entity.types[0])
@@ -171,6 +184,10 @@ class Bridge:
         service = robots.Service(self._ros, entity.name, kind)
         robot.requests.services[word] = service
         return service
+
+    def _services_of(self, name: str) -> dict[str, robots.Service]:
+        robot = self._robots.get(name)
+        return robot.requests.services if robot is not None and robot.requests is not None else {}
 
     async def _robot(self, name: str) -> _Robot:
         robot = self._robots.get(name)

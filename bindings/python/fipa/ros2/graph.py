@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from rclpy.action import get_action_names_and_types
@@ -17,6 +17,8 @@ from fipa.ros2.ros import NODE
 CONTROLS = ("rcl_interfaces", "lifecycle_msgs", "type_description_interfaces", "composition_interfaces")
 
 _STATUS = "/_action/status"
+#: The name of a node that was discovered in part.
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,15 @@ class Entity:
     servers: frozenset[object] = frozenset()
     #: The lifecycle nodes that offer it.
     lifecycle: tuple[str, ...] = ()
+    #: The policies of its publishers.
+    policies: tuple[object, ...] = ()
+    #: Whether a bridge publishes it, too: its messages would go round.
+    is_looped: bool = False
+
+    def follows(self, known: Entity) -> bool:
+        """Whether this is the same as at an earlier look, perhaps with further servers."""
+        is_alike = (self.types, self.policies, self.is_looped) == (known.types, known.policies, known.is_looped)
+        return is_alike and self.servers >= known.servers
 
 
 def all_entities(node: Node) -> list[Entity]:
@@ -47,38 +58,49 @@ def mapped_entities(node: Node, mapping: Mapping) -> list[Entity]:
     named = [it for it in all_entities(node) if mapping.maps(it.kind, it.name)]
     if not named:
         return []
-    nodes = _nodes_of_services(node)
+    nodes, managed = _nodes_of_services(node)
     entities = []
     for entity in named:
-        servers: Iterable[object] = ()
         if entity.kind == "services":
-            by = nodes.get(entity.name, [])
-            # ROS numbers no servers of services.
-            servers = range(node.count_services(entity.name))
+            publishers, by = [], nodes.get(entity.name, [])
         else:
             topic = entity.name + _STATUS if entity.kind == "actions" else entity.name
             publishers = node.get_publishers_info_by_topic(topic)
             by = [_full(it.node_namespace, it.node_name) for it in publishers]
-            if entity.kind == "actions":
-                servers = (bytes(it.endpoint_gid) for it in publishers)
-        others = [name for name in by if not _is_bridge(name)]
-        if others:
-            lifecycle = tuple(name for name in others if f"{name}/get_state" in nodes)
-            entities.append(Entity(entity.kind, entity.name, entity.types, frozenset(servers), lifecycle))
+        # A node that was discovered in part has its name at the next look.
+        others = [name for name in by if not _is_bridge(name) and not name.endswith(_UNKNOWN)]
+        if not others:
+            continue
+        lifecycle = tuple(name for name in others if name in managed)
+        found = replace(entity, lifecycle=lifecycle)
+        if entity.kind == "topics":
+            policies = _policies(publishers)
+            found = replace(found, policies=policies, is_looped=any(map(_is_bridge, by)))
+        elif entity.kind == "actions":
+            found = replace(found, servers=frozenset(bytes(it.endpoint_gid) for it in publishers))
+        else:
+            # ROS numbers no servers of services.
+            found = replace(found, servers=frozenset(range(node.count_services(entity.name))))
+        entities.append(found)
     return entities
 
 
-def _nodes_of_services(node: Node) -> dict[str, list[str]]:
-    servers: dict[str, list[str]] = {}
+def _nodes_of_services(node: Node) -> tuple[dict[str, list[str]], set[str]]:
+    """The nodes of each service, and the lifecycle nodes."""
+    nodes: dict[str, list[str]] = {}
+    managed = set()
     for name, namespace in set(node.get_node_names_and_namespaces()):
-        for service in _services_of(node, name, namespace):
-            servers.setdefault(service, []).append(_full(namespace, name))
-    return servers
+        full = _full(namespace, name)
+        for service, types in _services_of(node, name, namespace):
+            nodes.setdefault(service, []).append(full)
+            if service == f"{full}/get_state" and "lifecycle_msgs/srv/GetState" in types:
+                managed.add(full)
+    return nodes, managed
 
 
-def _services_of(node: Node, name: str, namespace: str) -> Iterable[str]:
+def _services_of(node: Node, name: str, namespace: str) -> list[tuple[str, list[str]]]:
     try:
-        return [service for service, _ in node.get_service_names_and_types_by_node(name, namespace)]
+        return list(node.get_service_names_and_types_by_node(name, namespace))
     except Exception:  # rclpy raises NodeNameNonExistentError, or RuntimeError in other releases
         # The node has ended since it was listed.
         return []
@@ -92,18 +114,25 @@ def _is_bridge(name: str) -> bool:
     return name.rsplit("/", 1)[1].startswith(NODE)
 
 
+def _policies(publishers: Iterable[Any]) -> tuple[Any, Any]:
+    """Reliability and durability of a subscription that fits every publisher."""
+    profiles = [it.qos_profile for it in publishers]
+    is_reliable = all(it.reliability == ReliabilityPolicy.RELIABLE for it in profiles)
+    is_kept = bool(profiles) and all(it.durability == DurabilityPolicy.TRANSIENT_LOCAL for it in profiles)
+    return (
+        ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT,
+        DurabilityPolicy.TRANSIENT_LOCAL if is_kept else DurabilityPolicy.VOLATILE,
+    )
+
+
 def profile(node: Node, topic: str, longest: int) -> QoSProfile:
     """The policies of a subscription that fits every publisher of a topic."""
-    profiles = [it.qos_profile for it in node.get_publishers_info_by_topic(topic)]
-    is_reliable = all(it.reliability == ReliabilityPolicy.RELIABLE for it in profiles)
-    is_kept = all(it.durability == DurabilityPolicy.TRANSIENT_LOCAL for it in profiles)
-    depth = max((it.depth for it in profiles), default=0)
-    return QoSProfile(
-        # ROS does not tell every depth.
-        depth=min(max(depth, 1 if is_kept else 10), longest),
-        reliability=ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if is_kept else DurabilityPolicy.VOLATILE,
-    )
+    publishers = node.get_publishers_info_by_topic(topic)
+    reliability, durability = _policies(publishers)
+    # ROS does not tell every depth.
+    least = 1 if durability == DurabilityPolicy.TRANSIENT_LOCAL else 10
+    depth = max((it.qos_profile.depth for it in publishers), default=0)
+    return QoSProfile(depth=min(max(depth, least), longest), reliability=reliability, durability=durability)
 
 
 def listing(entities: Iterable[Entity]) -> str:

@@ -26,6 +26,7 @@
 from __future__ import annotations
 
 import fnmatch
+import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,6 +58,9 @@ class Foreign:
 
 #: The kinds of what ROS offers, as in the file.
 KINDS = ("actions", "services", "topics")
+
+#: A part of a name of ROS.
+_WORD = re.compile("[A-Za-z_][A-Za-z0-9_]*")
 
 _CHOICES = {"content": ("json", "cdr"), "client_gone": ("cancel", "continue")}
 
@@ -108,7 +112,7 @@ def _mapping(text: dict[str, Any]) -> Mapping:
         **names,
         robot=robot,
         settings={name: _settings(value, f'settings."{name}"') for name, value in settings.items()},
-        agents={name: _foreign(value, f"agents.{name}") for name, value in agents.items()},
+        agents={name: _foreign(name, value) for name, value in agents.items()},
     )
 
 
@@ -126,11 +130,18 @@ def _settings(value: Any, at: str) -> Settings:
     return Settings(**{**table, "fenced_by": (fence[0], fence[1])})
 
 
-def _foreign(value: Any, at: str) -> Foreign:
+def _foreign(agent: str, value: Any) -> Foreign:
+    at = f"agents.{agent}"
     table = _table(value, at)
     _known(table, at, KINDS)
-    for kind in KINDS:
-        _texts(list(_table(table.get(kind, {}), f"{at}.{kind}").values()), f"{at}.{kind}")
+    for kind, middle in (("actions", "action"), ("services", "srv"), ("topics", "msg")):
+        offered = _table(table.get(kind, {}), f"{at}.{kind}")
+        for word, name in offered.items():
+            if not all(_WORD.fullmatch(part) for part in (*agent.split("/"), word)):
+                raise WrongMapping(f"{at}.{kind}.{word}: ROS has no such name; letters, digits and _ are allowed")
+            parts = name.split("/") if isinstance(name, str) else []
+            if len(parts) != 3 or parts[1] != middle:
+                raise WrongMapping(f"{at}.{kind}.{word}: expected a type PACKAGE/{middle}/NAME, got {name!r}")
     return Foreign(**table)
 
 

@@ -6,13 +6,15 @@ import asyncio
 import json
 import logging
 import uuid
+from collections import Counter
 from collections.abc import Coroutine
+from datetime import datetime, timezone
 from typing import Any, Protocol
 
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
@@ -20,7 +22,7 @@ import fipa
 from fipa import sl
 from fipa.ros2 import describe, graph, values
 from fipa.ros2.mapping import Settings
-from fipa.ros2.ros import MAX_CALLS, Inbox, Ros
+from fipa.ros2.ros import Inbox, Ros
 
 _log = logging.getLogger("fipa.ros2")
 
@@ -29,6 +31,18 @@ _SPACE = uuid.UUID("8d5a2c7e-0c53-5c0f-9a55-6b1b5a3f7d10")
 
 #: Maximum number of messages of a topic that wait for the agent, and that the agent keeps for new subscribers.
 WAITING = 64
+
+#: Maximum size of a message of a topic in JSON, in bytes of ROS.
+MAX_JSON = 1_000_000
+
+#: Maximum number of goals and of requests of one client that wait for an action or a service.
+SHARE = 32
+
+#: Maximum number of calls that a server has not answered. Further ones wait: its queue in ROS loses what is too much.
+AT_ONCE = 8
+
+#: Maximum time for the answer of a service, in seconds.
+LONGEST = 60.0
 
 #: Time for the answer of an action server to a goal, in seconds. The client waits ten seconds.
 ANSWER = 5.0
@@ -58,9 +72,6 @@ class Tasks:
     def __init__(self) -> None:
         self._running: set[asyncio.Task[None]] = set()
 
-    def __len__(self) -> int:
-        return len(self._running)
-
     def start(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)
         self._running.add(task)
@@ -82,11 +93,13 @@ class Action:
     def __init__(self, ros: Ros, agent: fipa.Agent, name: str, word: str, kind: Any, settings: Settings) -> None:
         self._ros = ros
         self._kind = kind
-        self._client = ActionClient(ros.node, kind, name)
         self._gone = asyncio.Event()
         self._tasks = Tasks()
+        self._slots = asyncio.Semaphore(AT_ONCE)
+        self._shares: Counter[str | None] = Counter()
         self.name = name
         self.goals = agent.goals(describe.action(word, kind, settings))
+        self._client = ActionClient(ros.node, kind, name)
 
     async def run(self) -> None:
         async for goal in self.goals:
@@ -99,19 +112,24 @@ class Action:
         await self._ros.call(self._client.destroy)
 
     async def _pursue(self, goal: fipa.Goal) -> None:
+        self._shares[goal.client] += 1
         try:
             try:
                 reason = await self._lead(goal)
-            except (values.Mismatch, _Gone) as error:
+            except (ValueError, _Gone) as error:
                 reason = str(error)
             if reason is not None:
                 goal.fail(reason)
         except fipa.Error as error:
             # The time for a stop is over: the client has an outcome.
             _log.info("a goal of %s has ended before: %s", self.name, error)
+        finally:
+            self._shares -= Counter([goal.client])
 
     async def _lead(self, goal: fipa.Goal) -> str | None:
         """Leads a goal to its result. Returns the reason of a failure."""
+        if self._shares[goal.client] > SHARE:
+            return f"{SHARE} goals of the client run already"
         message = values.from_json(self._kind.Goal, goal.arguments)
         if self._ros.node.count_services(f"{self.name}/_action/send_goal") > 1:
             return f"{self.name} has more than one action server"
@@ -123,7 +141,8 @@ class Action:
         try:
             sending = _Sending(self._client, message, identity, feedback)
             try:
-                handle = await _unless(gone, asyncio.ensure_future(self._ros.call(sending.begin)), ANSWER)
+                async with self._slots:
+                    handle = await _unless(gone, asyncio.ensure_future(self._ros.call(sending.begin)), ANSWER)
             except TimeoutError:
                 return "the action server does not answer; it may have died"
             waits.append(result := asyncio.ensure_future(self._ros.call(handle.get_result_async)))
@@ -177,7 +196,11 @@ async def _wait(pending: Any) -> Any:
 async def _report(goal: fipa.Goal, feedback: Inbox) -> None:
     while True:
         message = await feedback.get()
-        goal.progress(value=values.to_json(message))
+        try:
+            goal.progress(value=values.to_json(message))
+        except values.TooLarge:
+            # The result may be smaller.
+            pass
 
 
 async def _unless(gone: asyncio.Future[Any], work: asyncio.Future[Any], within: float | None = None) -> Any:
@@ -211,6 +234,8 @@ class Service:
         self._kind = kind
         self._client = ros.node.create_client(kind, name)
         self._gone = asyncio.Event()
+        self._slots = asyncio.Semaphore(AT_ONCE)
+        self._shares: Counter[str | None] = Counter()
 
     async def run(self) -> None:
         await self._gone.wait()
@@ -221,27 +246,51 @@ class Service:
 
     async def answer(self, task: fipa.Task, arguments: dict[str, Any]) -> None:
         """Answers a request."""
+        client = task.letter.sender
+        if self._shares[client] >= SHARE:
+            await task.refuse(f"{SHARE} requests of {client} wait already")
+            return
         try:
             message = values.from_json(self._kind.Request, arguments)
         except values.Mismatch as error:
             await task.refuse(str(error))
             return
-        await task.agree()
         gone = asyncio.ensure_future(self._gone.wait())
-        work = asyncio.ensure_future(self._ros.call(self._client.call_async, message))
+        work = asyncio.ensure_future(self._call(message))
         cancelled = asyncio.ensure_future(_wait(task.cancelled()))
         cancelled.add_done_callback(lambda _: work.cancel())
+        self._shares[client] += 1
         try:
-            answer = await _unless(gone, work)
+            await task.agree()
+            answer = await _unless(gone, work, _left(task.letter))
             await task.inform(written(task.letter, values.to_json(answer)))
         except asyncio.CancelledError:
             # ROS has no cancel of a service: its answer is ignored.
             await task.inform("cancelled")
-        except _Gone as error:
+        except TimeoutError:
+            await task.fail("the service has not answered in time")
+        except fipa.Error:
+            raise
+        except Exception as error:
+            # Also a text that ROS does not send.
             await task.fail(str(error))
         finally:
+            self._shares -= Counter([client])
             gone.cancel()
+            # And the work.
             cancelled.cancel()
+
+    async def _call(self, message: Any) -> Any:
+        async with self._slots:
+            # This function of rclpy may be called in each thread.
+            return await self._ros.finished(self._client.call_async(message))
+
+
+def _left(letter: fipa.Letter) -> float:
+    """The time for the answer to a request, in seconds."""
+    if letter.reply_by is None:
+        return LONGEST
+    return max(0.0, min((letter.reply_by - datetime.now(timezone.utc)).total_seconds(), LONGEST))
 
 
 class Requests:
@@ -261,17 +310,17 @@ class Requests:
 
     async def _answer(self, task: fipa.Task) -> None:
         try:
-            word, arguments = read(task.letter)
+            try:
+                word, arguments = read(task.letter)
+            except (ValueError, RecursionError, fipa.Error) as error:
+                await task.refuse(f"expected a service with its arguments, such as (set_bool :data true): {error}")
+                return
             service = self.services.get(word)
-            if len(self._tasks) > MAX_CALLS:
-                await task.refuse(f"{MAX_CALLS} requests wait already")
-            elif service is None:
+            if service is None:
                 known = ", ".join(sorted(self.services)) or "none"
                 await task.refuse(f"{word!r} is no service of this agent; its services: {known}")
             else:
                 await service.answer(task, arguments)
-        except ValueError as error:
-            await task.refuse(f"expected a service with its arguments, such as (set_bool :data true): {error}")
         except fipa.Error as error:
             # The client is gone.
             _log.info("a request has ended: %s", error)
@@ -309,65 +358,56 @@ class Topic:
 
     def __init__(self, ros: Ros, agent: fipa.Agent, name: str, word: str, kind: Any, content: str) -> None:
         self._ros = ros
+        self._kind = kind
         self.name = name
         self._is_raw = content == "cdr"
         profile = graph.profile(ros.node, name, WAITING)
-        is_kept = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        self._is_kept = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._inbox = Inbox(ros, WAITING)
         self._publisher = agent.publisher(
             word,
             language="ros2-cdr" if self._is_raw else "json",
             ontology=values.name_of(kind),
-            latched=profile.depth if is_kept else 0,
+            latched=profile.depth if self._is_kept else 0,
         )
-        self._subscription = ros.node.create_subscription(
-            kind, name, self._inbox.put, profile, raw=self._is_raw, event_callbacks=mismatch(ros, name)
-        )
+        # Its bytes: only a message that some agent wants is decoded.
+        self._subscription = ros.node.create_subscription(kind, name, self._inbox.put, profile, raw=True)
         self._task: asyncio.Task[None] | None = None
+        self._warned_at = 1
+        self._too_large = 0
 
     async def run(self) -> None:
         self._task = asyncio.current_task()
-        dropped, warned_at = 0, 1
         while True:
-            message = await self._inbox.get()
-            if self._is_raw:
-                with memoryview(message) as content:
-                    loan = self._publisher.loan(len(content))
-                    with memoryview(loan) as place:
-                        place[:] = content
-                await loan.publish()
-            else:
-                await self._publisher.publish(json.dumps(values.to_json(message)).encode())
-            dropped = self._inbox.dropped
-            if dropped >= warned_at:
-                warned_at = dropped * 2
-                _log.warning("%s: %d messages were dropped, because subscribers are slow", self.name, dropped)
+            message: bytes = await self._inbox.get()
+            if self._is_kept or self._publisher.subscribers:
+                await self._publish(message)
+            lost = self._inbox.dropped + self._too_large
+            if lost >= self._warned_at:
+                self._warned_at = lost * 2
+                _log.warning(
+                    "%s: %d messages were dropped, because subscribers are slow, and %d, because they are larger than "
+                    '%d bytes: set `content = "cdr"`',
+                    self.name,
+                    self._inbox.dropped,
+                    self._too_large,
+                    MAX_JSON,
+                )
+
+    async def _publish(self, message: bytes) -> None:
+        if self._is_raw:
+            loan = self._publisher.loan(len(message))
+            with memoryview(loan) as place:
+                place[:] = message
+            await loan.publish()
+        elif len(message) > MAX_JSON:
+            self._too_large += 1
+        else:
+            value = values.to_json(deserialize_message(message, self._kind))
+            await self._publisher.publish(json.dumps(value).encode())
 
     async def close(self) -> None:
         await self._ros.call(self._ros.node.destroy_subscription, self._subscription)
         if self._task is not None:
             self._task.cancel()
         self._publisher.close()
-
-
-def mismatch(ros: Ros, name: str) -> SubscriptionEventCallbacks:
-    """Warns once when the policies of a publisher do not fit those of the bridge."""
-    warned = False
-
-    def warn(_event: object) -> None:
-        nonlocal warned
-        if warned:
-            return
-        warned = True
-        ends = ros.node.get_publishers_info_by_topic(name) + ros.node.get_subscriptions_info_by_topic(name)
-        policies = "; ".join(f"{end.node_name}: {_policies(end.qos_profile)}" for end in ends)
-        _log.warning("%s: policies that do not fit: %s", name, policies)
-
-    return SubscriptionEventCallbacks(incompatible_qos=warn)
-
-
-def _policies(profile: Any) -> str:
-    return f"{profile.reliability.name.lower()}, {profile.durability.name.lower()}"
-
-
-

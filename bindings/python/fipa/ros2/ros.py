@@ -1,7 +1,6 @@
 """The node of the bridge, and the thread in which its callbacks run.
 
-The loop of the agents calls functions there with `Ros.call`. The thread calls the loop with `Ros.ask` and `Inbox`, which
-are bounded.
+The loop of the agents calls functions there with `Ros.call`. The thread reaches the loop by `Ros.ask` and `Inbox`.
 """
 
 from __future__ import annotations
@@ -24,13 +23,8 @@ _log = logging.getLogger("fipa.ros2")
 #: The beginning of the names of nodes of bridges. A bridge does not map what another one offers.
 NODE = "fipa_bridge"
 
-#: Maximum number of calls that wait: of agents for the services of a robot, and of ROS for agents. Further ones are
-#: refused. The library bounds the goals of agents.
-MAX_CALLS = 256
-
-
-class Full(Exception):
-    """Too many calls wait already."""
+#: Maximum number of bytes that wait in an `Inbox`, beside its newest item.
+MAX_WAITING = 64_000_000
 
 
 class Ros:
@@ -43,7 +37,6 @@ class Ros:
         self.loop = loop
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
-        self._asked = 0
         self._is_closed = False
         self._thread = threading.Thread(target=self._spin, name="ros", daemon=True)
         self._thread.start()
@@ -69,40 +62,45 @@ class Ros:
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Calls a function in the thread of ROS. Awaits its result, if that is a future of rclpy."""
         done: asyncio.Future[Any] = self.loop.create_future()
-        awaited: list[Future[Any]] = []
-
-        def settle(settled: Callable[[Any], None], value: Any) -> None:
-            self.soon(lambda: None if done.done() else settled(value))
-
-        def finish(future: Future[Any]) -> None:
-            if (error := future.exception()) is not None:
-                settle(done.set_exception, error)
-            else:
-                settle(done.set_result, future.result())
 
         def run() -> None:
+            if done.cancelled():
+                return
             try:
                 result = function(*arguments)
             except Exception as error:
-                settle(done.set_exception, error)
-                return
-            if isinstance(result, Future):
-                awaited.append(result)
-                result.add_done_callback(finish)
+                self.soon(settle, done.set_exception, error)
             else:
-                settle(done.set_result, result)
+                self.soon(settle, done.set_result, result)
 
+        def settle(settled: Callable[[Any], None], value: Any) -> None:
+            if not done.done():
+                settled(value)
+            elif isinstance(value, Future):
+                self._executor.create_task(value.cancel)
+
+        self._executor.create_task(run)
+        result = await done
+        return await self.finished(result) if isinstance(result, Future) else result
+
+    async def finished(self, future: Future[Any]) -> Any:
+        """Awaits a future of rclpy. Cancels it with the wait."""
+        done: asyncio.Future[Any] = self.loop.create_future()
+
+        def finish(future: Future[Any]) -> None:
+            error = future.exception()
+            settled, value = (done.set_result, future.result()) if error is None else (done.set_exception, error)
+            self.soon(lambda: None if done.done() else settled(value))
+
+        future.add_done_callback(finish)
         try:
-            self._executor.create_task(run)
             return await done
         except asyncio.CancelledError:
-            self._executor.create_task(lambda: [future.cancel() for future in awaited])
+            self._executor.create_task(future.cancel)
             raise
 
     async def ask(self, work: Callable[[], Coroutine[Any, Any, Any]]) -> Any:
-        """Runs a coroutine in the loop of the agents, for a callback in the thread of ROS. Raises `Full`."""
-        if self._asked >= MAX_CALLS:
-            raise Full(f"{MAX_CALLS} calls wait for agents already")
+        """Runs a coroutine in the loop of the agents, for a callback in the thread of ROS."""
         answer: Future[Any] = Future(executor=self._executor)
 
         async def run() -> None:
@@ -113,13 +111,11 @@ class Ros:
             # In the thread of ROS, so that the executor wakes up.
             self._executor.create_task(settled, value)
 
-        self._asked += 1
         # The loop has only a weak reference to the task.
         running = asyncio.run_coroutine_threadsafe(run(), self.loop)
         try:
             return await answer
         finally:
-            self._asked -= 1
             running.cancel()
 
     def soon(self, function: Callable[..., Any], *arguments: Any) -> None:
@@ -137,25 +133,33 @@ class Inbox:
         self._ros = ros
         self._items: deque[Any] = deque()
         self._bound = bound
+        self._size = 0
         self._lock = threading.Lock()
         self._ready = asyncio.Event()
         self.dropped = 0
 
     def put(self, item: Any) -> None:
         """Called in the thread of ROS."""
+        size = len(item) if isinstance(item, bytes) else 0
         with self._lock:
-            if len(self._items) == self._bound:
-                self._items.popleft()
+            while self._items and (len(self._items) == self._bound or self._size + size > MAX_WAITING):
+                self._take()
                 self.dropped += 1
-            self._items.append(item)
+            self._items.append((item, size))
+            self._size += size
             wakes = len(self._items) == 1
         if wakes:
             self._ros.soon(self._ready.set)
+
+    def _take(self) -> Any:
+        item, size = self._items.popleft()
+        self._size -= size
+        return item
 
     async def get(self) -> Any:
         while True:
             with self._lock:
                 if self._items:
-                    return self._items.popleft()
+                    return self._take()
                 self._ready.clear()
             await self._ready.wait()

@@ -23,6 +23,8 @@ from typing import Any
 
 from rosidl_parser import definition as idl
 
+#: Maximum number of elements of a list in JSON.
+MAX_ELEMENTS = 100_000
 
 _NUMBERS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _FLOATS = {"float", "double", "long double"}
@@ -61,6 +63,10 @@ def name_of(kind: Any) -> str:
     return f"{package}/{word.split('.')[0]}/{kind.__name__}"
 
 
+class TooLarge(ValueError):
+    """A message that is too large for JSON."""
+
+
 class Mismatch(ValueError):
     """A value that a ROS type does not have: `pose.position.x: expected a number, got "left"`."""
 
@@ -87,7 +93,7 @@ def is_bytes(kind: Any) -> bool:
 
 
 def to_json(message: Any) -> dict[str, Any]:
-    """Writes a message."""
+    """Writes a message. Raises `TooLarge`."""
     return {name: _write(getattr(message, name), kind) for name, kind in fields(type(message))}
 
 
@@ -96,6 +102,8 @@ def _write(value: Any, kind: Any) -> Any:
         if is_bytes(kind):
             joined = b"".join(value) if getattr(kind.value_type, "typename", None) == "octet" else bytes(value)
             return base64.b64encode(joined).decode()
+        if len(value) > MAX_ELEMENTS:
+            raise TooLarge(f"a list of {len(value)} elements is too large for JSON, which holds {MAX_ELEMENTS}")
         return [_write(element, kind.value_type) for element in value]
     if isinstance(kind, idl.NamespacedType):
         return to_json(value)
@@ -121,7 +129,8 @@ def from_json(message_type: Any, value: Any, path: str = "") -> Any:
     message = message_type()
     known = dict(fields(message_type))
     for name, part in value.items():
-        at = f"{path}.{name}" if path else name
+        word = name if name.isidentifier() else repr(name)
+        at = f"{path}.{word}" if path else word
         if name not in known:
             raise Mismatch(at, f"a field of {', '.join(known) or 'none'}", name)
         setattr(message, name, _read(part, known[name], at))

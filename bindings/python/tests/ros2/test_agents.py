@@ -24,6 +24,10 @@ lift = "test_msgs/srv/BasicTypes"
 state = "std_msgs/msg/String"
 [agents.sensor.topics]
 depth = "std_msgs/msg/Float64"
+[agents.slow.services]
+never = "test_msgs/srv/BasicTypes"
+[agents.slow.actions]
+never = "test_msgs/action/Fibonacci"
 [agents.ear.services]
 tell = "test_msgs/srv/BasicTypes"
 """
@@ -96,6 +100,28 @@ class Agents(unittest.TestCase):
         self.assertTrue(self.bridge.has_logged("too low"))
         self.assertFalse(future.done())
 
+    def test_an_agent_that_does_not_answer_delays_no_other(self) -> None:
+        slow = self.domain.register("slow").wait()
+        self.addCleanup(slow.deregister)
+        order = {"name": "order", "type": "integer"}
+        goals = slow.goals({"name": "never", "decides": True, "parameters": [order]})
+        requests = slow.tasks("fipa-request")
+        self.addCleanup(goals.close)
+        never = self.node.create_client(BasicTypes, "/slow/never")
+        self.assertTrue(never.wait_for_service(LONG))
+        action = ActionClient(self.node, Fibonacci, "/slow/never")
+        self.addCleanup(action.destroy)
+        self.assertTrue(action.wait_for_server(LONG))
+        waiting = [never.call_async(BasicTypes.Request()) for _ in range(3)]
+        waiting.append(action.send_goal_async(Fibonacci.Goal()))
+        for _ in range(20):
+            rclpy.spin_once(self.node, timeout_sec=0.01)
+        held = [requests.next().wait(LONG), goals.next().wait(LONG)]
+        self.test_a_service_answers()
+        self.test_an_action_has_feedback_and_a_result()
+        self.assertFalse(any(it.done() for it in waiting))
+        del held
+
     def test_a_topic_is_heard(self) -> None:
         heard: list[str] = []
         self.node.create_subscription(String, "/arm_1/state", lambda it: heard.append(it.data), 10)
@@ -124,7 +150,7 @@ class Agents(unittest.TestCase):
 
     def test_a_wrong_notification_is_dropped_with_a_warning(self) -> None:
         self.state.publish(fipa.sl.dumps({"date": "up"})).wait(LONG)
-        until(lambda: self.bridge.has_logged("a notification is dropped: date"), "the warning")
+        until(lambda: self.bridge.has_logged("notifications are dropped, the last because: date"), "the warning")
 
 
 def count_up(goal: fipa.Goal, order: int) -> dict[str, list[int]]:

@@ -111,6 +111,7 @@ class Robots(unittest.TestCase):
             ("(double :int8_value 200)", "from -128 to 127"),
             ("(triple)", "its services: double"),
             ("((", "expected a service with its arguments"),
+            ("(double :int64_value " + "9" * 5000 + ")", "expected a service with its arguments"),
         ):
             with self.subTest(content), self.assertRaisesRegex(fipa.Refused, reason):
                 self.own.request(fipa.Message("request", "crex", content)).wait(LONG)
@@ -121,6 +122,29 @@ class Robots(unittest.TestCase):
         self.own.send(fipa.Message("query-ref", "crex", "(all ?x (is ?x))")).wait(LONG)
         answer = self.own.receive().wait(LONG)
         self.assertEqual((answer.performative, answer.sender), ("not-understood", "crex"))
+
+    def test_json_that_python_does_not_take_is_answered(self) -> None:
+        for content, reason in (
+            ('{"@": "double", "string_value": ' + "[" * 100_000, "expected a service with its arguments"),
+            ('{"@": "double", "string_value": "\\ud800"}', "surrogates"),
+        ):
+            with self.subTest(reason), self.assertRaisesRegex(fipa.Refused, reason):
+                self.own.request(fipa.Message("request", "crex", content, language="json")).wait(LONG)
+
+    def test_many_requests_at_once_are_answered_and_each_client_has_a_share(self) -> None:
+        def begin() -> fipa.Request:
+            return self.own.begin_request(fipa.Message("request", "crex", "(double :int64_value 4)"))
+
+        for request in [begin() for _ in range(32)]:
+            self.assertIn(":int64_value 8", request.result().wait(LONG).text)
+        refused = 0
+        for request in [begin() for _ in range(200)]:
+            try:
+                request.result().wait(LONG)
+            except fipa.Refused as error:
+                self.assertIn("32 requests of operator wait already", str(error))
+                refused += 1
+        self.assertLess(refused, 200)
 
     def test_a_text_of_ten_megabytes_comes_back(self) -> None:
         content = json.dumps({"@": "double", "string_value": "x" * 10_000_000})
@@ -260,12 +284,25 @@ class Graphs(unittest.TestCase):
             with domain.register("viewer").wait().subscribe("crex", "thing") as letters:
                 self.assertEqual(next(letters).ontology, "std_msgs/msg/Int64")
 
-    def test_policies_that_do_not_fit_are_told_once(self) -> None:
-        self.site.talker("/crex/thing", "std_msgs/String")
+    def test_a_publisher_that_returns_with_other_policies_is_heard(self) -> None:
+        first = self.site.talker("/crex/thing", "std_msgs/String")
         until(lambda: self.bridge.has_logged("/crex/thing is topic"), "the mapping")
         self.site.talker("/crex/thing", "std_msgs/String", "best_effort")
-        until(lambda: self.bridge.has_logged("policies that do not fit"), "the warning")
-        self.assertRegex(self.bridge.log.read_text(), ": best_effort, volatile; fipa_bridge: reliable, volatile")
+        first.kill()
+        until(lambda: self.bridge.log.read_text().count("/crex/thing is topic") == 2, "the new mapping")
+        with fipa.Domain() as domain:
+            with domain.register("viewer").wait().subscribe("crex", "thing") as letters:
+                self.assertEqual(json.loads(next(letters).text), {"data": ""})
+
+    def test_a_topic_that_a_bridge_publishes_is_not_mapped(self) -> None:
+        self.site.bridge('[agents.crex.topics]\nthing = "std_msgs/msg/String"\n', name="other")
+        self.site.talker("/crex/thing", "std_msgs/String")
+        until(lambda: self.bridge.has_logged("/crex/thing is published by a bridge, too"), "the warning")
+
+    def test_the_names_of_the_platform_are_not_mapped(self) -> None:
+        bridge = self.site.bridge('topics = ["/df/*"]', name="other")
+        self.site.talker("/df/thing", "std_msgs/String")
+        until(lambda: bridge.has_logged("is the name of an agent of the platform: df"), "the warning")
 
     def test_topics_of_a_lifecycle_node_are_there_while_it_is_active(self) -> None:
         talker = self.site.talker("/crex/thing", "std_msgs/String", "lifecycle", stdin=subprocess.PIPE)
@@ -314,6 +351,8 @@ class Commands(unittest.TestCase):
             ('actions = ["crex/x"]', 'names of ROS begin with "/"'),
             ("actions = [", "bridge.toml"),
             ('[settings."/x"]\ncontent = "xml"', "expected json or cdr, got 'xml'"),
+            ('[agents.a.actions]\nmove = "std_msgs/msg/String"', "expected a type PACKAGE/action/NAME"),
+            ('[agents.arm-1.topics]\nx = "std_msgs/msg/String"', "ROS has no such name"),
             ('[agents.a.actions]\nmove = "arm_msgs/action/Move"', "source the workspace with the package arm_msgs"),
             ('[agents.a.actions]\nmove = "test_msgs/action/Move"', "the package test_msgs has no action Move"),
         ):
