@@ -79,7 +79,9 @@ class Tasks:
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._running.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
+        error = None if task.cancelled() else task.exception()
+        # The end of an agent closes its sequences.
+        if error is not None and not isinstance(error, fipa.Closed):
             _log.error("a conversation has failed", exc_info=error)
 
     async def end(self) -> None:
@@ -373,26 +375,27 @@ class Topic:
         # Its bytes: only a message that some agent wants is decoded.
         self._subscription = ros.node.create_subscription(kind, name, self._inbox.put, profile, raw=True)
         self._task: asyncio.Task[None] | None = None
+        #: Number of messages that could not be published, and why the last one could not.
+        self._unpublished, self._reason = 0, "none"
         self._warned_at = 1
-        self._too_large = 0
 
     async def run(self) -> None:
         self._task = asyncio.current_task()
         while True:
             message: bytes = await self._inbox.get()
             if self._is_kept or self._publisher.subscribers:
-                await self._publish(message)
-            lost = self._inbox.dropped + self._too_large
+                try:
+                    await self._publish(message)
+                except fipa.Closed:
+                    return
+                except Exception as error:
+                    # A message that is too large, or that Python cannot read, does not end the topic.
+                    self._unpublished, self._reason = self._unpublished + 1, str(error)[:200]
+            lost = self._inbox.dropped + self._unpublished
             if lost >= self._warned_at:
                 self._warned_at = lost * 2
-                _log.warning(
-                    "%s: %d messages were dropped, because subscribers are slow, and %d, because they are larger than "
-                    '%d bytes: set `content = "cdr"`',
-                    self.name,
-                    self._inbox.dropped,
-                    self._too_large,
-                    MAX_JSON,
-                )
+                text = "%s: %d messages were dropped, because subscribers are slow, %d for other reasons; the last: %s"
+                _log.warning(text, self.name, self._inbox.dropped, self._unpublished, ascii(self._reason))
 
     async def _publish(self, message: bytes) -> None:
         if self._is_raw:
@@ -401,7 +404,7 @@ class Topic:
                 place[:] = message
             await loan.publish()
         elif len(message) > MAX_JSON:
-            self._too_large += 1
+            raise values.TooLarge(f'it has {len(message)} bytes; set `content = "cdr"` for more than {MAX_JSON}')
         else:
             value = values.to_json(deserialize_message(message, self._kind))
             await self._publisher.publish(json.dumps(value).encode())

@@ -1,6 +1,6 @@
 """A publisher of ROS as its makers write it.
 
-    talker.py NAME PACKAGE/TYPE [best_effort] [lifecycle]
+    talker.py NAME PACKAGE/TYPE [best_effort] [lifecycle] [large] [broken]
 
 A lifecycle node reads transitions, such as `activate`, from the standard input.
 """
@@ -25,7 +25,12 @@ def main() -> None:
     is_managed = "lifecycle" in options
     node = LifecycleNode("talker") if is_managed else Node("talker")
     publisher = node.create_publisher(message_type, name, QoSProfile(depth=10, reliability=reliability))
-    node.create_timer(0.1, lambda: publisher.publish(message_type()))
+    message = message_type()
+    if "large" in options:
+        message.data = "x" * 2_000_000
+    # A text that is longer than the message.
+    broken = bytes([0, 1, 0, 0, 0xFF, 0xFF, 0xFF, 0x7F, 0x61, 0x62])
+    node.create_timer(0.1, lambda: publisher.publish(broken if "broken" in options else message))
     if is_managed:
         threading.Thread(target=transitions, args=(node,), daemon=True).start()
     try:

@@ -294,6 +294,20 @@ class Graphs(unittest.TestCase):
             with domain.register("viewer").wait().subscribe("crex", "thing") as letters:
                 self.assertEqual(json.loads(next(letters).text), {"data": ""})
 
+    def test_messages_that_cannot_be_passed_on_do_not_end_a_topic(self) -> None:
+        with fipa.Domain() as domain:
+            viewer = domain.register("viewer").wait()
+            for option, reason in (("large", 'content = "cdr"'), ("broken", "failed to deserialize")):
+                name = f"/crex/{option}"
+                self.site.talker(name, "std_msgs/String", option)
+                self.site.talker(name, "std_msgs/String", "--ros-args", "-r", f"__node:={option}")
+                until(lambda name=name: self.bridge.has_logged(f"{name} is topic"), "the mapping")
+                with viewer.subscribe("crex", option) as letters:
+                    while not self.bridge.has_logged(f"{name}: 0 messages were dropped"):
+                        self.assertEqual(json.loads(next(letters).text), {"data": ""})
+                    self.assertEqual(json.loads(next(letters).text), {"data": ""})
+                self.assertTrue(self.bridge.has_logged(reason))
+
     def test_a_topic_that_a_bridge_publishes_is_not_mapped(self) -> None:
         self.site.bridge('[agents.crex.topics]\nthing = "std_msgs/msg/String"\n', name="other")
         self.site.talker("/crex/thing", "std_msgs/String")
