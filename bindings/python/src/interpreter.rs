@@ -6,11 +6,10 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::{ThreadId, current, park, sleep};
 use std::time::Duration;
 
+use parking_lot::Condvar;
 use pyo3::call::PyCallArgs;
 use pyo3::types::PyAnyMethods as _;
 use pyo3::{Bound, PyAny, PyResult, Python, pyfunction};
-
-use crate::log;
 
 /// Number of the threads that are in a [section].
 static INSIDE: AtomicUsize = AtomicUsize::new(0);
@@ -22,6 +21,10 @@ thread_local! {
 
 /// The thread that ends the interpreter.
 static ENDS: OnceLock<ThreadId> = OnceLock::new();
+
+/// Notified at the end of the interpreter, and when log lines are added or were logged. A wait on it looks at
+/// [`is_ending`].
+pub(crate) static LOG_OR_END: Condvar = Condvar::new();
 
 /// Does a part of a call in which the thread may give up the interpreter's lock: a wait, or a call into Python.
 ///
@@ -95,7 +98,7 @@ pub(crate) fn ending(py: Python<'_>) {
     py.detach(|| {
         while INSIDE.load(Ordering::SeqCst) > 0 {
             // Each time: it may have been about to wait.
-            log::wake();
+            LOG_OR_END.notify_all();
             sleep(Duration::from_millis(1));
         }
     });

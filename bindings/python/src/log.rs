@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::time::{Duration, Instant};
 
 use fipa_acl::{escape, is_unprintable};
-use parking_lot::{Condvar, Mutex};
+use parking_lot::Mutex;
 use pyo3::types::PyAnyMethods as _;
 use pyo3::{PyResult, Python, pyfunction};
 use tracing::field::{Field, Visit};
@@ -18,7 +18,7 @@ use tracing::level_filters::LevelFilter;
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Level, Metadata, Subscriber};
 
-use crate::interpreter::{away, call, is_ending};
+use crate::interpreter::{LOG_OR_END, away, call, is_ending};
 
 /// Maximum number of lines that wait. The oldest are dropped.
 const MAX_LINES: usize = 256;
@@ -31,9 +31,6 @@ static WAITING: Mutex<Lines> = Mutex::new(Lines {
     missed: 0,
     is_given: false,
 });
-
-/// Notified when lines are added or were logged, and at the end of the interpreter.
-static CHANGED: Condvar = Condvar::new();
 
 /// Whether lines wait, for a check without the lock.
 static HAS_LINES: AtomicBool = AtomicBool::new(false);
@@ -79,7 +76,7 @@ pub(crate) fn deliver(py: Python<'_>) -> PyResult<()> {
     };
     let logged = call(py, "fipa._log", "emit", (Vec::from(lines), missed));
     WAITING.lock().is_given = false;
-    CHANGED.notify_all();
+    LOG_OR_END.notify_all();
     logged.map(drop)
 }
 
@@ -88,7 +85,7 @@ pub(crate) fn deliver_all(py: Python<'_>) -> PyResult<()> {
     away(py, || {
         let due = Instant::now() + MAX_WAIT;
         let mut waiting = WAITING.lock();
-        while waiting.is_given && !CHANGED.wait_until(&mut waiting, due).timed_out() {}
+        while waiting.is_given && !LOG_OR_END.wait_until(&mut waiting, due).timed_out() {}
     });
     deliver(py)
 }
@@ -101,7 +98,7 @@ pub(crate) fn follow(py: Python<'_>) {
         away(py, || {
             let mut waiting = WAITING.lock();
             while (waiting.lines.is_empty() || waiting.is_given) && !is_ending() {
-                CHANGED.wait(&mut waiting);
+                LOG_OR_END.wait(&mut waiting);
             }
         });
         if is_ending() {
@@ -111,11 +108,6 @@ pub(crate) fn follow(py: Python<'_>) {
             error.write_unraisable(py, None);
         }
     }
-}
-
-/// Wakes the thread of [`follow`] at the end of the interpreter.
-pub(crate) fn wake() {
-    CHANGED.notify_all();
 }
 
 /// Collects the events of all threads.
@@ -162,7 +154,7 @@ impl Subscriber for Collector {
         waiting.lines.push_back(line);
         HAS_LINES.store(true, Ordering::Relaxed);
         drop(waiting);
-        CHANGED.notify_all();
+        LOG_OR_END.notify_all();
     }
 
     fn new_span(&self, _: &Attributes<'_>) -> Id {

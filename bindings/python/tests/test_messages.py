@@ -298,7 +298,8 @@ class Logging(unittest.TestCase):
                     agent = domain.register("waits_{number}").wait()
                     async def receive():
                         await asyncio.wait_for(agent.receive(), 60)
-                    print("ready", flush=True)
+                    # One write: the thread that logs writes, too.
+                    logging.info("ready")
                     {wait}
                     """
                 )
