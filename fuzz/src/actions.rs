@@ -32,7 +32,7 @@ const ACTS: [&str; 9] = [
     "(cancel-goals :action hold)",
 ];
 
-/// What a conversation was told.
+/// The last output that a conversation got.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Told {
     Nothing,

@@ -26,7 +26,7 @@ const MAX_SUBSCRIPTIONS: usize = 256;
 /// The result of a goal.
 pub(crate) type Outcome = Result<Option<Term<'static>>, Failure>;
 
-/// What a client is told about its goal.
+/// The events that a client gets about its goal.
 pub(crate) enum Told {
     /// The goal is accepted.
     Agreed {

@@ -613,7 +613,8 @@ fipa_result fipa_goal_progress(fipa_handle goal,
 
 /*
  Ends a goal: with its result, a value in JSON or an empty text, if `is_done` is not 0; else with a failure, whose
- reason is the text; a goal of an action with `decides` that was not accepted is refused with it. The caller closes the handle afterwards. A goal that is closed without an end fails.
+ reason is the text; a goal of an action with `decides` that was not accepted is refused with it. The caller closes
+ the handle afterwards. A goal that is closed without an end fails.
 
  # Safety
  The text must be readable.

@@ -27,8 +27,10 @@ const TIMEOUT: Duration = Duration::from_secs(30);
 
 #[pymethods]
 impl Agent {
-    /// Publishes a topic. `media_type` is for users. Each notification carries `language` and `ontology`. With a `rate` in notifications per second, the topic is a stream:
-    /// subscribers get the newest notification. A new subscriber gets the `latched` newest contents, at most 64.
+    /// Publishes a topic. `media_type` is for users. Each notification carries `language` and `ontology`.
+    ///
+    /// With a `rate` in notifications per second, the topic is a stream: subscribers get the newest notification. A
+    /// new subscriber gets the `latched` newest contents, at most 64.
     #[pyo3(signature = (topic, *, media_type=None, language=None, ontology=None, rate=None, latched=0))]
     #[allow(clippy::too_many_arguments, reason = "most are options with a name")]
     fn publisher(

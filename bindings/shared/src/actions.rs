@@ -153,8 +153,8 @@ impl Pursuit {
         Ok(())
     }
 
-    /// Ends the goal at once, with its result, `None` for an action without one, or with the reason of its failure. A goal of an
-    /// action with `decides` that fails before it is accepted is refused with that reason.
+    /// Ends the goal at once, with its result, `None` for an action without one, or with the reason of its failure. A
+    /// goal of an action with `decides` that fails before it is accepted is refused with that reason.
     ///
     /// # Errors
     /// If the goal has ended already, or SL has no form for the result.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -16,7 +15,7 @@ from rclpy.qos import QoSProfile
 import fipa
 from fipa import sl
 from fipa.ros2 import values
-from fipa.ros2.ros import Ros
+from fipa.ros2.ros import Doubling, Ros
 
 _log = logging.getLogger("fipa.ros2")
 
@@ -159,8 +158,7 @@ class AgentService(Offered):
             content = sl.dumps({"@": self._word, **values.to_json(message)})
             asked = fipa.Message("request", self._agent, content, language="fipa-sl")
             letter = await self._own.request(asked, timeout=REQUEST)
-            text = letter.text
-            answer = json.loads(text) if letter.language == "json" else sl.loads(text) if text else {}
+            answer = values.content(letter) if letter.text else {}
             if isinstance(answer, dict):
                 answer.pop("@", None)
             return values.from_json(self._kind.Response, answer)
@@ -187,6 +185,7 @@ class AgentTopic(Offered):
         self._publisher = self._ros.node.create_publisher(self._kind, self._name, profile, event_callbacks=events)
         self._has_warned = False
         self._dropped = 0
+        self._warnings = Doubling()
         self._task: asyncio.Task[None] | None = None
         self._ros.soon(self._begin)
 
@@ -233,14 +232,12 @@ class AgentTopic(Offered):
                 wrong = f"the type is {letter.ontology!r}"
             else:
                 try:
-                    value = json.loads(letter.text) if letter.language == "json" else sl.loads(letter.text)
-                    self._publisher.publish(values.from_json(self._kind, value))
+                    self._publisher.publish(values.from_json(self._kind, values.content(letter)))
                     return
                 except (ValueError, RecursionError, fipa.Error) as error:
                     wrong = str(error)
         self._dropped += 1
-        # At the first, second, fourth, eighth.
-        if self._dropped & (self._dropped - 1) == 0:
+        if self._warnings.is_due(self._dropped):
             _log.warning("%s: %d notifications are dropped, the last because: %s", self._name, self._dropped, wrong)
 
 

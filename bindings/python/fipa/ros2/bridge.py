@@ -18,7 +18,7 @@ from fipa.ros2.values import UnknownType, load
 
 _log = logging.getLogger("fipa.ros2")
 
-#: Time between two looks at the graph in seconds. ROS tells nobody that a server has died.
+#: Time between two looks at the graph in seconds. ROS reports no end of a server.
 LOOK = 0.5
 
 #: Time until the directory is asked again, if it did not answer, in seconds.
@@ -138,25 +138,30 @@ class Bridge:
             if (entity.kind, entity.name) not in is_open:
                 await self._open(entity)
 
-    async def _open(self, entity: Entity) -> None:
+    def _obstacle(self, entity: Entity, place: tuple[str, str] | None) -> str | None:
+        """Returns why this cannot be mapped to a place, an agent and the name there."""
         if len(entity.types) > 1:
-            self._warn(entity, f"has several types: {', '.join(entity.types)}")
-            return
+            return f"has several types: {', '.join(entity.types)}"
         if entity.is_looped:
-            self._warn(entity, "is published by a bridge, too: its messages would go round")
-            return
+            return "is published by a bridge, too: its messages would go round"
         if len(entity.servers) > 1:
-            self._warn(entity, f"has {len(entity.servers)} servers; one is expected")
-            return
-        place = self._mapping.agent_of(entity.name)
+            return f"has {len(entity.servers)} servers; one is expected"
         if place is None:
-            self._warn(entity, 'has no namespace: set `robot = "NAME"` in the mapping')
-            return
-        if place[0] in ("df", "ams"):
-            self._warn(entity, f"has a namespace that is the name of an agent of the platform: {place[0]}")
-            return
-        if entity.kind == "services" and place[1] in self._services_of(place[0]):
-            self._warn(entity, f"is not mapped: {place[0]} has a service {place[1]} already")
+            return 'has no namespace: set `robot = "NAME"` in the mapping'
+        agent, word = place
+        if agent in ("df", "ams"):
+            return f"has a namespace that is the name of an agent of the platform: {agent}"
+        robot = self._robots.get(agent)
+        requests = robot.requests if robot is not None else None
+        if entity.kind == "services" and requests is not None and word in requests.services:
+            return f"is not mapped: {agent} has a service {word} already"
+        return None
+
+    async def _open(self, entity: Entity) -> None:
+        place = self._mapping.agent_of(entity.name)
+        obstacle = self._obstacle(entity, place)
+        if place is None or obstacle is not None:
+            self._warn(entity, obstacle or "")
             return
         try:
             kind = load(entity.types[0])
@@ -184,10 +189,6 @@ class Bridge:
         service = robots.Service(self._ros, entity.name, kind)
         robot.requests.services[word] = service
         return service
-
-    def _services_of(self, name: str) -> dict[str, robots.Service]:
-        robot = self._robots.get(name)
-        return robot.requests.services if robot is not None and robot.requests is not None else {}
 
     async def _robot(self, name: str) -> _Robot:
         robot = self._robots.get(name)

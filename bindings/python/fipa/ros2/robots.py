@@ -22,7 +22,7 @@ import fipa
 from fipa import sl
 from fipa.ros2 import describe, graph, values
 from fipa.ros2.mapping import Settings
-from fipa.ros2.ros import Inbox, Ros
+from fipa.ros2.ros import Doubling, Inbox, Ros
 
 _log = logging.getLogger("fipa.ros2")
 
@@ -342,7 +342,7 @@ async def answer_others(agent: fipa.Agent) -> None:
 
 def read(letter: fipa.Letter) -> tuple[str, dict[str, Any]]:
     """Reads the content of a request: `(set_bool :data true)` in SL, `{"@": "set_bool", "data": true}` in JSON."""
-    value = json.loads(letter.text) if letter.language == "json" else sl.loads(letter.text)
+    value = values.content(letter)
     if isinstance(value, str):
         return value, {}
     if not isinstance(value, dict) or not isinstance(word := value.pop("@", None), str):
@@ -377,7 +377,7 @@ class Topic:
         self._task: asyncio.Task[None] | None = None
         #: Number of messages that could not be published, and why the last one could not.
         self._unpublished, self._reason = 0, "none"
-        self._warned_at = 1
+        self._warnings = Doubling()
 
     async def run(self) -> None:
         self._task = asyncio.current_task()
@@ -392,8 +392,7 @@ class Topic:
                     # A message that is too large, or that Python cannot read, does not end the topic.
                     self._unpublished, self._reason = self._unpublished + 1, str(error)[:200]
             lost = self._inbox.dropped + self._unpublished
-            if lost >= self._warned_at:
-                self._warned_at = lost * 2
+            if self._warnings.is_due(lost):
                 text = "%s: %d messages were dropped, because subscribers are slow, %d for other reasons; the last: %s"
                 _log.warning(text, self.name, self._inbox.dropped, self._unpublished, ascii(self._reason))
 

@@ -126,6 +126,19 @@ class Ros:
             pass
 
 
+class Doubling:
+    """Says when to warn of a count again: when it has doubled since the last warning."""
+
+    def __init__(self) -> None:
+        self._next = 1
+
+    def is_due(self, count: int) -> bool:
+        if count < self._next:
+            return False
+        self._next = count * 2
+        return True
+
+
 class Inbox:
     """A bounded queue from the thread of ROS to the loop. A full one drops its oldest item, and counts it."""
 

@@ -17,11 +17,15 @@ import base64
 import binascii
 import functools
 import importlib
+import json
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rosidl_parser import definition as idl
+
+import fipa
+from fipa import sl
 
 #: Maximum number of elements of a list in JSON.
 MAX_ELEMENTS = 100_000
@@ -90,6 +94,11 @@ def integer_range(kind: Any) -> tuple[int, int] | None:
 
 def is_bytes(kind: Any) -> bool:
     return isinstance(kind, idl.AbstractNestedType) and getattr(kind.value_type, "typename", None) in _BYTES
+
+
+def content(letter: fipa.Letter) -> Any:
+    """Reads the content of a letter, in JSON or SL. Raises `ValueError`, `RecursionError` and `fipa.Error`."""
+    return json.loads(letter.text) if letter.language == "json" else sl.loads(letter.text)
 
 
 def to_json(message: Any) -> dict[str, Any]:
