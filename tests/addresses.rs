@@ -47,6 +47,7 @@ fn service(name: &str) -> (Mts, Arc<MemoryDirectory>, Location) {
             contacts: None,
             tap: None,
             gate: None,
+            counts: None,
         },
         directory.clone(),
         vec![transport as Arc<dyn Transport>],

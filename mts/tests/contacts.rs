@@ -132,6 +132,7 @@ impl Gateway {
             contacts: Some(contacts.clone()),
             tap: None,
             gate: None,
+            counts: None,
         };
         let directory = MemoryDirectory::new(fipa_sds::MtsId::new("mts", Incarnation::from_u64(2)));
         for number in 0..AGENTS {

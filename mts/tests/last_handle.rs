@@ -75,6 +75,7 @@ fn no_transport_is_closed_from_within_a_call_of_its_own() {
         })),
         tap: None,
         gate: None,
+        counts: None,
     };
     let own = Incarnation::from_u64(1);
     let directory = MemoryDirectory::new(fipa_sds::MtsId::new("mts", own));

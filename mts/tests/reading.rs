@@ -76,6 +76,7 @@ impl Gateway {
             contacts: None,
             tap: None,
             gate: Some(gate),
+            counts: None,
         };
         let own = Incarnation::from_u64(1);
         let directory = MemoryDirectory::new(fipa_sds::MtsId::new("mts", own));

@@ -137,6 +137,7 @@ fn sent(letters: impl IntoIterator<Item = Letter>) -> (Arc<Shared>, Vec<Parcel>)
         contacts: None,
         tap: None,
         gate: None,
+        counts: None,
     };
     let core = CoreConfig {
         forwards: true,

@@ -76,6 +76,7 @@ fn all_tasks_that_are_about_to_wait_are_told_that_the_agent_is_gone() {
         contacts: None,
         tap: None,
         gate: None,
+        counts: None,
     };
     let directory = MemoryDirectory::new(fipa_sds::MtsId::new("mts", own));
     let core = CoreConfig::new("mts", own, vec![Kind::Shm]);

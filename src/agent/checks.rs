@@ -13,11 +13,13 @@ use fipa_monitor::{
 };
 use fipa_mts::core::Received;
 use fipa_sds::{Directory, Entry, Reach, Resolution, Role, resolve};
+use fipa_transport::counts::SharedCounts;
 use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
 
 use crate::agent::incoming::Incoming;
 use crate::config::{self, Check};
+use crate::domain::counting;
 use crate::error::{ProtocolError, SendError};
 
 /// The settings of `[monitor]` and the known protocols, for all agents of this process.
@@ -70,8 +72,14 @@ impl Rules {
     }
 
     /// Creates the checks of an agent that has just been registered in this directory. Its own
-    /// conversation ids begin with `ids`.
-    pub(crate) fn checks(&self, agent: &str, ids: String, directory: &dyn Directory) -> Checks {
+    /// conversation ids begin with `ids`. Violations count in `counts`.
+    pub(crate) fn checks(
+        &self,
+        agent: &str,
+        ids: String,
+        directory: &dyn Directory,
+        counts: SharedCounts,
+    ) -> Checks {
         if self.check == Check::Off {
             return Checks(None);
         }
@@ -86,6 +94,7 @@ impl Rules {
             ids,
             enforce: self.check == Check::Enforce,
             answer: self.answer,
+            counts,
         })))
     }
 }
@@ -104,6 +113,7 @@ struct Monitored {
     ids: String,
     enforce: bool,
     answer: bool,
+    counts: SharedCounts,
 }
 
 /// The origin of a received letter, as far as its link proves it.
@@ -308,7 +318,11 @@ impl Monitored {
             }
         }
         match monitor.check(header, now) {
-            Verdict::Violation(violation) => Some(violation),
+            Verdict::Violation(violation) => {
+                let protocol = counting::protocol_number(&violation.protocol);
+                (*self.counts).as_ref().shared_violation(protocol);
+                Some(violation)
+            }
             _ => None,
         }
     }
@@ -441,6 +455,7 @@ mod tests {
     use fipa_acl::{AgentId, Time};
     use fipa_mts::letter_for;
     use fipa_sds::{MemoryDirectory, MtsId, Registration};
+    use fipa_transport::counts::Counts;
     use fipa_transport::{Kind, PeerId};
 
     use super::*;
@@ -492,7 +507,7 @@ mod tests {
         (config.monitor.check, config.monitor.answer) = (Check::Enforce, true);
         let rules = Rules::load(&config.monitor).unwrap();
         let directory = directory();
-        let checks = rules.checks("rover", "c-".to_owned(), &directory);
+        let checks = rules.checks("rover", "c-".to_owned(), &directory, Arc::new(Counts::default()));
         let received = received(&message, sender, Some(Kind::Tcp));
         let origin = Origin::of(&received);
         let incoming = Incoming::new(received).unwrap();
@@ -533,7 +548,7 @@ mod tests {
             config.monitor.check = Check::Enforce;
             let rules = Rules::load(&config.monitor).unwrap();
             let directory = directory();
-            let checks = rules.checks("rover", "c-".to_owned(), &directory);
+            let checks = rules.checks("rover", "c-".to_owned(), &directory, Arc::new(Counts::default()));
             let arrived = |message: &Message| {
                 let received = received_at(caller, message, ARM, Some(Kind::Tcp));
                 let origin = Origin::of(&received);

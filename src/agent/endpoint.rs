@@ -58,6 +58,7 @@ impl Endpoint {
                 &name,
                 unique_ids_of(incarnation),
                 &*domain.inner.service.host,
+                domain.inner.service.counting.shared(),
             ),
             domain,
             id,

@@ -50,6 +50,9 @@ const MAX_PEERS: usize = 1024;
 /// Maximum number of addresses in `security.legacy_peers`.
 const MAX_LEGACY_PEERS: usize = 64;
 
+/// Maximum number of names in `http.names`.
+const MAX_HTTP_NAMES: usize = 16;
+
 /// Maximum number of networks in `contacts.networks`.
 const MAX_NETWORKS: usize = 64;
 
@@ -131,6 +134,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
     found.security(config);
+    found.http(&config.http);
     if config.contacts.networks.len() > MAX_NETWORKS {
         let path = ["contacts", "networks"];
         found.too_many(&path, config.contacts.networks.len(), MAX_NETWORKS);
@@ -181,6 +185,29 @@ impl Findings {
                 format_args!("cannot be {directory:?}, which differs between working directories"),
                 "write the full path, for example /run/fipa",
             );
+        }
+    }
+
+    fn http(&mut self, http: &Http) {
+        if !http.listen.is_empty() && !is_on_loopback(&http.listen) {
+            self.add(
+                &["http", "listen"],
+                format_args!(
+                    "is {:?}, which is no address of this host alone",
+                    http.listen
+                ),
+                "use 127.0.0.1 or [::1] and a port, for example 127.0.0.1:9790; a proxy or an SSH tunnel serves others",
+            );
+        }
+        if http.token_file.starts_with('~') {
+            self.add(
+                &["http", "token_file"],
+                "begins with ~, which only shells expand",
+                "write the full path, for example /etc/fipa/http.token",
+            );
+        }
+        if http.names.len() > MAX_HTTP_NAMES {
+            self.too_many(&["http", "names"], http.names.len(), MAX_HTTP_NAMES);
         }
     }
 

@@ -311,6 +311,27 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| size_text(config.security.peer_bytes),
     },
     Key {
+        path: &["http", "listen"],
+        shape: Shape::Text,
+        expected: r#"an address such as "127.0.0.1:9790", or "" for none"#,
+        write: |config, value| text(value).map(|address| config.http.listen = address),
+        read: |config| Value::Text(config.http.listen.clone()),
+    },
+    Key {
+        path: &["http", "names"],
+        shape: Shape::List,
+        expected: r#"a list of host names such as ["robot.example"]"#,
+        write: |config, value| items(value, text).map(|all| config.http.names = all),
+        read: |config| Value::list(&config.http.names),
+    },
+    Key {
+        path: &["http", "token_file"],
+        shape: Shape::Text,
+        expected: r#"a file such as "/etc/fipa/http.token", or "" for one in the directory of the domain"#,
+        write: |config, value| text(value).map(|file| config.http.token_file = file),
+        read: |config| Value::Text(config.http.token_file.clone()),
+    },
+    Key {
         path: &["contacts", "networks"],
         shape: Shape::List,
         expected: r#"a list of networks such as ["10.0.0.0/8"]"#,

@@ -48,6 +48,10 @@
 //! insecure = false                    # true: listen on the network without keys
 //! loopback = false                    # with keys: legacy peers on loopback prove their identity, too
 //! legacy_peers = []                   # with keys: addresses of legacy peers, which have no keys
+//! [http]
+//! listen = ""                         # of the gateway, for Prometheus: "127.0.0.1:9790"; empty: off
+//! names = []                          # further names under which clients reach that address
+//! token_file = ""                     # file with the token of clients; empty: in the directory of the domain
 //! [contacts]
 //! networks = []                       # networks whose addresses in received identifiers are dialed
 //! [access]
@@ -130,6 +134,8 @@ pub struct Config {
     pub discovery: Discovery,
     /// `[security]`: the keys, and the limits for peers on other hosts.
     pub security: Security,
+    /// `[http]`: the address at which the gateway answers Prometheus.
+    pub http: Http,
     /// `[contacts]`: the addresses in agent identifiers that the gateway dials.
     pub contacts: Contacts,
     /// `[access]`: the rules for senders and receivers of letters.
@@ -296,6 +302,20 @@ pub struct Security {
     /// `peer_bytes`: maximum number of bytes per second that each transport accepts from one address;
     /// also the maximum burst. 0: no limit.
     pub peer_bytes: u64,
+}
+
+/// `[http]`: the address at which the gateway answers Prometheus and health checks.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[non_exhaustive]
+pub struct Http {
+    /// `listen`: the address, on loopback, for example `127.0.0.1:9790`. Empty: the gateway does not listen.
+    pub listen: String,
+    /// `names`: host names, beside addresses and `localhost`, under which clients reach the address, for example behind
+    /// a proxy. At most 16.
+    pub names: Vec<String>,
+    /// `token_file`: the file with the token that clients send. The gateway creates it if it is missing. Empty: the file
+    /// `http.token` in the directory of the domain, which ends with the domain.
+    pub token_file: String,
 }
 
 /// `[contacts]`: the addresses in agent identifiers that the gateway dials for an agent that no directory lists.
@@ -523,6 +543,7 @@ impl Config {
                 peer_letters: 20_000,
                 peer_bytes: 256 << 20,
             },
+            http: Http::default(),
             contacts: Contacts::default(),
             access: Access::default(),
             monitor: Monitor {

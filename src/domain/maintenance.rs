@@ -15,6 +15,7 @@ use tokio::runtime::Handle;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use crate::domain::background::{self, BackgroundError};
+use crate::domain::counting::{Counting, CountingError};
 use crate::domain::files::{DomainDir, DomainDirError};
 
 /// Time between two checks for removed files while the kernel reports no removals.
@@ -39,6 +40,8 @@ const RENEW_EVERY: Duration = Duration::from_secs(10 * 60);
 pub(crate) struct DirMaintenance {
     pub(crate) dir: DomainDir,
     pub(crate) host: Arc<HostDirectory>,
+    /// The place in which the process counts, unless it is only a tool.
+    counting: Option<Counting>,
     #[cfg(feature = "shm")]
     pub(crate) shm: Option<Weak<ShmTransport>>,
     pub(crate) unix: Option<Weak<UnixTransport>>,
@@ -51,6 +54,8 @@ enum RejoinError {
     DomainDir(#[from] DomainDirError),
     #[error(transparent)]
     Directory(#[from] HostError),
+    #[error(transparent)]
+    Counting(#[from] CountingError),
     #[cfg(feature = "shm")]
     #[error(transparent)]
     Shm(#[from] ShmError),
@@ -61,10 +66,15 @@ enum RejoinError {
 }
 
 impl DirMaintenance {
-    pub(crate) fn new(dir: DomainDir, host: Arc<HostDirectory>) -> Self {
+    pub(crate) fn new(
+        dir: DomainDir,
+        host: Arc<HostDirectory>,
+        counting: Option<Counting>,
+    ) -> Self {
         Self {
             dir,
             host,
+            counting,
             #[cfg(feature = "shm")]
             shm: None,
             unix: None,
@@ -168,7 +178,11 @@ impl DirMaintenance {
 
     fn rejoin(&mut self) -> Result<(), RejoinError> {
         self.dir.rejoin()?;
-        self.host.rejoin()?;
+        if self.host.rejoin()?
+            && let Some(counting) = &self.counting
+        {
+            counting.rejoin(&self.host)?;
+        }
         #[cfg(feature = "shm")]
         if let Some(shm) = self.shm() {
             shm.rejoin()?;

@@ -4,6 +4,7 @@ pub(crate) mod accounts;
 pub(crate) mod background;
 pub(crate) mod change_log;
 pub(crate) mod coalition;
+pub(crate) mod counting;
 pub(crate) mod directory_view;
 pub(crate) mod files;
 pub(crate) mod maintenance;

@@ -25,6 +25,7 @@ use crate::admin::reload::ReloadRequests;
 use crate::admin::watch::Watchers;
 use crate::config::{self, Reloaded};
 use crate::domain::change_log;
+use crate::domain::counting::Counting;
 use crate::domain::files::DomainDir;
 use crate::domain::maintenance::DirMaintenance;
 use crate::domain::membership::{self, Membership};
@@ -52,6 +53,8 @@ pub(crate) struct Service {
     /// Whether the service is the gateway.
     gateway: bool,
     gate: Arc<RulesGate>,
+    /// The place in which this process counts letters.
+    pub(crate) counting: Counting,
     watchers: Arc<Watchers>,
     /// The task that serves the watchers.
     watching: JoinHandle<()>,
@@ -138,7 +141,9 @@ impl Service {
         let watchers = Arc::new(Watchers::new(&own, role.gateway));
         let changes = change_log::start(&*view, &handle);
         let mut refused = Vec::new();
-        let mut maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host));
+        let counting = Counting::start(&host);
+        let mut maintenance =
+            DirMaintenance::new(dir.clone(), Arc::clone(&host), Some(counting.clone()));
         let mut parts = TransportParts {
             config,
             role: &role,
@@ -155,6 +160,7 @@ impl Service {
                 contacts: role.contacts.clone(),
                 tap: Some(Arc::clone(&watchers) as Arc<dyn fipa_mts::Tap>),
                 gate: Some(Arc::clone(&gate) as Arc<dyn AccessGate>),
+                counts: Some(counting.shared()),
             },
             view,
             transports,
@@ -166,6 +172,7 @@ impl Service {
         let service = Self {
             watchers,
             gate,
+            counting,
             gateway: role.gateway,
             changes,
             watching,

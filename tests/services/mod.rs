@@ -208,6 +208,7 @@ impl TestService {
             contacts: None,
             tap: None,
             gate: bounds.gate,
+            counts: None,
         };
         let transports = transports.into_iter().flatten().collect();
         let Started {

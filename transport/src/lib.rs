@@ -8,6 +8,7 @@
 //! * [`DomainUsers`] are the users whose processes share the files of a domain.
 //! * [`PeerId`] names the party that has one share of a bound.
 //! * [`TokenBucket`] limits the rate of a peer or a sender.
+//! * [`counts`] has the counters of a process, which others read.
 //! * [`log_limit`] limits the rate of log lines.
 //! * `conformance` (feature of that name) is the suite that every implementation passes.
 //!   [`Faulty`] wraps a transport and injects faults.
@@ -18,6 +19,7 @@
 mod conclusion;
 #[cfg(feature = "conformance")]
 pub mod conformance;
+pub mod counts;
 mod error;
 mod faulty;
 mod fnv;

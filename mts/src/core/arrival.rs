@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use fipa_acl::Letter;
 use fipa_sds::{Entry, Reach, Role};
+use fipa_transport::counts::{Direction, Event, LetterOutcome};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Parcel, Reaction, Realm, Report,
 };
@@ -95,6 +96,7 @@ impl Core {
         let ArrivalLink { via, from, ticket } = link;
         let read = self.reader.completed(read, &letter, from.is_remote());
         if let Err(refusal) = self.check_letter(label, &from, &letter, read.as_deref()) {
+            self.count_refusal(via, &refusal);
             return Reaction::Now(refusal);
         }
         let registration = label.stream.receiver;
@@ -107,13 +109,22 @@ impl Core {
             };
             let link = ArrivalLink { via, from, ticket };
             let reaction = self.forward(now, link, label, letter, (envelope, parts));
+            if let Reaction::Now(answer) = &reaction {
+                self.count_refusal(via, answer);
+            }
             self.send_failures(now);
             return reaction;
         };
         let seen = self.table.watched.then(|| letter.clone());
         let parts = read.as_ref().and_then(|read| read.parts.as_ref());
         let gate = self.reader.gate().map(|gate| (gate, parts));
+        let waiting = inbox.len();
         let answer = inbox.accept(now.instant, label, letter, (via, &from), gate);
+        // Otherwise an earlier copy was accepted.
+        if inbox.len() > waiting {
+            let counts = self.table.counts();
+            counts.letter(Direction::Received, Some(via), LetterOutcome::Delivered);
+        }
         if answer == Answer::Accepted {
             if let Some(letter) = seen {
                 let via = Some(via);
@@ -124,8 +135,19 @@ impl Core {
             }
             let agent = registration;
             self.table.actions.push_back(Action::Deliverable { agent });
+        } else {
+            self.count_refusal(via, &answer);
         }
         Reaction::Now(answer)
+    }
+
+    #[cold]
+    fn count_refusal(&self, via: Kind, answer: &Answer) {
+        let refused = FailureReason::Refused;
+        if matches!(answer, Answer::Failed { reason, .. } if *reason == refused) {
+            let counts = self.table.counts();
+            counts.letter(Direction::Received, Some(via), LetterOutcome::Refused);
+        }
     }
 
     /// Checks what a letter claims: its sender, its place in the stream, and its sizes.
@@ -270,6 +292,7 @@ impl Core {
     pub fn take(&mut self, agent: Incarnation) -> Option<Received> {
         let inbox = self.agents.get_mut(&agent)?;
         let received = inbox.take()?;
+        self.table.counts().event(Event::Read, 1);
         let receiver = Arc::clone(&inbox.name);
         for (stream, back) in inbox.credits() {
             self.table.credit(stream, Arc::clone(&receiver), back);

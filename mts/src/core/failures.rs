@@ -6,6 +6,7 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Dialect, ErrorChain, Letter};
 use fipa_sds::{Entry, MtsId, Reach, Role, Source};
+use fipa_transport::counts::{Direction, Event, LetterOutcome};
 use fipa_transport::{
     FailureReason, Incarnation, Kind, LegacySource, Location, PeerId, Signature, Stream, log_limit,
     quota_address,
@@ -136,6 +137,9 @@ impl Core {
                     }
                 };
                 if inbox.push_failure(letter.clone()) {
+                    let counts = self.table.counts();
+                    counts.event(Event::FailureMessage, 1);
+                    counts.letter(Direction::Received, None, LetterOutcome::Delivered);
                     let stream = Stream::between(own, agent);
                     let name = Arc::clone(&inbox.name);
                     self.table.notice(stream, sequence, &name, || News::Taken {

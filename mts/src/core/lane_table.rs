@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::Time;
 use fipa_sds::{Entry, Source, View};
+use fipa_transport::counts::{Counts, SharedCounts};
 use fipa_transport::{
     Attempt, AttemptId, Body, FailureReason, Incarnation, Location, Parcel, Principal, Stream,
     TransportError, TransportErrorKind,
@@ -49,6 +50,8 @@ pub(crate) struct LaneTable {
     pub(super) custody: LaneBudget,
     pub(super) routes: Routes,
     pub(super) tallies: Tallies,
+    /// The counters of this process.
+    counts: SharedCounts,
     /// Whether a watcher is notified of events.
     pub(crate) watched: bool,
     /// Smoothed time in which each service acknowledges reports.
@@ -77,12 +80,22 @@ impl LaneTable {
             custody: LaneBudget::default(),
             routes: Routes::default(),
             tallies: Tallies::default(),
+            counts: Arc::new(Counts::default()),
             watched: false,
             round_trips: Map::default(),
             next_attempt: 1,
             refreshing: VecDeque::new(),
             refreshes: 0,
         }
+    }
+
+    /// The counters of this process. Only the core writes them, except those of violations.
+    pub(crate) fn counts(&self) -> &Counts {
+        (*self.counts).as_ref()
+    }
+
+    pub(super) fn count_in(&mut self, counts: SharedCounts) {
+        self.counts = counts;
     }
 
     /// The reason for which a letter to an agent fails that the directory does not list. For a [lost

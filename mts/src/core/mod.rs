@@ -90,6 +90,7 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use fipa_sds::View;
+use fipa_transport::counts::{Event, SharedCounts};
 use fipa_transport::{AttemptId, Conclusion, FailureReason, Incarnation, Kind};
 
 pub use self::action::Action;
@@ -220,6 +221,13 @@ impl Core {
         self
     }
 
+    /// Counts here from now on.
+    #[must_use]
+    pub fn counting(mut self, counts: SharedCounts) -> Self {
+        self.table.count_in(counts);
+        self
+    }
+
     /// Returns the reader of the letters for [`handle_read_arrival`](Self::handle_read_arrival).
     #[must_use]
     pub fn reader(&self) -> &LetterReader {
@@ -246,6 +254,8 @@ impl Core {
         self.fail_waiting(is_own, FailureReason::Closed);
         if let Some(mut inbox) = self.agents.remove(&incarnation) {
             let receiver = Arc::clone(&inbox.name);
+            self.table.counts()
+                .event(Event::Read, inbox.len() as u64);
             for (stream, back) in inbox.all_waiting() {
                 self.table.credit(stream, Arc::clone(&receiver), back);
             }

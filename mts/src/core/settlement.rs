@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use fipa_transport::counts::{Direction, Event};
 use fipa_transport::{Answer, Body, Outcome, Parcel, Report, Stream};
 
 use super::News;
@@ -16,6 +17,7 @@ impl LaneTable {
     /// Reports the end of a letter to its sender, or to the services that handed it over.
     pub(crate) fn settle(
         &mut self,
+        now: Instant,
         open_letter: Box<OpenLetter>,
         stream: Stream,
         receiver: Arc<str>,
@@ -25,9 +27,19 @@ impl LaneTable {
             origin,
             sequence,
             deadline,
+            since,
             ..
         } = *open_letter;
         if let Settlement::Outcome(outcome) = &settlement {
+            let counts = self.counts();
+            let after = now.saturating_duration_since(since);
+            match origin {
+                Origin::Local { .. } => counts.settled(Direction::Sent, outcome, after),
+                Origin::Forwarded { .. } | Origin::LegacyPeer { .. } => {
+                    counts.settled(Direction::Forwarded, outcome, after);
+                }
+                Origin::FailureMessage => counts.event(Event::FailureMessage, 1),
+            }
             self.notice(stream, sequence, &receiver, || News::Settled {
                 outcome: outcome.clone(),
                 sender: !matches!(origin, Origin::Forwarded { .. }),

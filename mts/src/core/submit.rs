@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::Letter;
 use fipa_sds::{Entry, Resolution, Role};
+use fipa_transport::counts::{Direction, Event};
 use fipa_transport::{Attempt, FailureReason, Incarnation, Outcome, Stream};
 
 use super::action::Action;
@@ -350,6 +351,7 @@ impl Core {
             let reason = FailureReason::QueueFull;
             return self.undeliverable(submission, sender, Arc::clone(name), letter, reason);
         }
+        self.table.counts().event(Event::Submitted, 1);
         let sequence = self.sequence_of(sender);
         self.table.notice(stream, sequence, name, || News::Sent {
             submission: Some(submission),
@@ -402,6 +404,9 @@ impl Core {
         let details: Vec<String> = attempts.iter().map(ToString::to_string).collect();
         let detail = details.join("; ");
         let outcome = Outcome::Failed { reason, attempts };
+        let counts = self.table.counts();
+        counts.event(Event::Submitted, 1);
+        counts.settled(Direction::Sent, &outcome, Duration::ZERO);
         let sequence = self.sequence_of(sender);
         let stream = Stream::between(sender, Incarnation::UNKNOWN);
         self.table

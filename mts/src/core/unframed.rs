@@ -7,6 +7,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use fipa_acl::{AclRepresentation, DecodeError, EncodeError, Letter, Message};
 use fipa_sds::{Entry, Reach, Resolution, View};
+use fipa_transport::counts::{Direction, LetterOutcome};
 use fipa_transport::{
     FailureReason, Incarnation, Kind, LegacySource, Outcome, Stream, log_limit, quota_address,
 };
@@ -373,6 +374,10 @@ impl Core {
         if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
             && inbox.push_unframed(letter.clone(), via, from.address)
         {
+            let outcome = LetterOutcome::Delivered;
+            self.table
+                .counts()
+                .letter(Direction::Received, Some(via), outcome);
             self.table
                 .notice(stream, sequence, &entry.name, || News::Taken {
                     via: Some(via),

@@ -22,6 +22,7 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Letter};
 use fipa_sds::{Change, Directory, Entry, View};
+use fipa_transport::counts::SharedCounts;
 use fipa_transport::{
     Abandoned, Attempt, Conclusion, Incarnation, Introduction, Kind, ListenError, Location,
     Outcome, OwnerProcess, Principal, Transport, TransportError, TransportErrorKind, log_limit,
@@ -55,6 +56,8 @@ pub struct RuntimeConfig {
     pub tap: Option<Arc<dyn Tap>>,
     /// Decides which letters are accepted; without one, all are. Called with the service locked.
     pub gate: Option<Arc<dyn AccessGate>>,
+    /// Where the service counts letters; without it, in memory of its own.
+    pub counts: Option<SharedCounts>,
 }
 
 impl fmt::Debug for RuntimeConfig {
@@ -272,6 +275,9 @@ impl Mts {
         let mut core = Core::new(core, directory.view());
         if let Some(gate) = &config.gate {
             core = core.gated(Arc::clone(gate));
+        }
+        if let Some(counts) = &config.counts {
+            core = core.counting(Arc::clone(counts));
         }
         let reader = core.reader().clone();
         let state = State {

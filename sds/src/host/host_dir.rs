@@ -9,6 +9,7 @@ use std::io::{self, Read as _, Write as _};
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use fipa_transport::{DirectoryError, DomainUsers, log_limit};
@@ -37,14 +38,20 @@ pub(super) enum Name {
     Remote(Id),
     /// `<id>.socket`: the socket of the process, if it accepts connections.
     Socket(Id),
+    /// `<id>.counts`: the page in which the process counts, see [`fipa_transport::counts`].
+    Counts(Id),
+    /// `ended.counts`: the sum of the counters of processes that have ended.
+    Ended,
     /// `<id>.tmp`: a file that will be renamed to one of the others.
     Temporary(Id),
 }
 
 impl Name {
     pub(super) fn parse(name: &str) -> Option<Self> {
-        if name == "lock" {
-            return Some(Self::Domain);
+        match name {
+            "lock" => return Some(Self::Domain),
+            "ended.counts" => return Some(Self::Ended),
+            _ => {}
         }
         let (id, kind) = name.split_once('.')?;
         if id.len() != 16 || !id.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f')) {
@@ -56,6 +63,7 @@ impl Name {
             "entries" => Some(Self::Entries(id)),
             "remote" => Some(Self::Remote(id)),
             "socket" => Some(Self::Socket(id)),
+            "counts" => Some(Self::Counts(id)),
             "tmp" => Some(Self::Temporary(id)),
             _ => None,
         }
@@ -70,6 +78,8 @@ impl std::fmt::Display for Name {
             Self::Entries(Id(id)) => write!(f, "{id:016x}.entries"),
             Self::Remote(Id(id)) => write!(f, "{id:016x}.remote"),
             Self::Socket(Id(id)) => write!(f, "{id:016x}.socket"),
+            Self::Counts(Id(id)) => write!(f, "{id:016x}.counts"),
+            Self::Ended => f.write_str("ended.counts"),
             Self::Temporary(Id(id)) => write!(f, "{id:016x}.tmp"),
         }
     }
@@ -88,6 +98,8 @@ pub(super) struct HostDir {
     id: Id,
     /// Never read: the lock on it, open for writing, shows that this process is running.
     process: Mutex<Option<File>>,
+    /// Whether the process has a page of counters.
+    counts: AtomicBool,
 }
 
 /// Timeout for the lock of the domain while nothing changes in the directory. A process holds the
@@ -136,6 +148,7 @@ impl HostDir {
             threads: Mutex::default(),
             id,
             process: Mutex::new(None),
+            counts: AtomicBool::new(false),
         };
         let deadline = Instant::now() + LONGEST;
         while !host_dir.try_join(cancellation)? {
@@ -181,6 +194,7 @@ impl HostDir {
             threads: Mutex::default(),
             id: Id(0),
             process: Mutex::new(None),
+            counts: AtomicBool::new(false),
         }))
     }
 
@@ -236,7 +250,13 @@ impl HostDir {
         let dir = examined(rustix::fs::fstat(&self.dir))?;
         Ok(dir == examined(rustix::fs::lstat(&self.path))?
             && examined(rustix::fs::fstat(&self.domain))? == named(Name::Domain)?
-            && examined(rustix::fs::fstat(process))? == named(Name::Process(self.id))?)
+            && examined(rustix::fs::fstat(process))? == named(Name::Process(self.id))?
+            && (!self.counts.load(Ordering::Relaxed) || named(Name::Counts(self.id))?.is_some()))
+    }
+
+    /// Notes that the process has a page of counters from now on.
+    pub(super) fn has_counts(&self) {
+        self.counts.store(true, Ordering::Relaxed);
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -497,7 +517,7 @@ impl HostDir {
         }
     }
 
-    fn create(&self, name: Name) -> Result<File, HostError> {
+    pub(super) fn create(&self, name: Name) -> Result<File, HostError> {
         let file = self.users.create_file(&self.dir, &name.to_string());
         file.map(File::from).map_err(self.io("create", name))
     }
@@ -541,8 +561,12 @@ const fn index_of(generation: u64) -> usize {
 fn slot_of(name: Name) -> [u8; SLOT] {
     let (Id(id), kind) = match name {
         Name::Remote(id) => (id, 1_u64),
-        Name::Entries(id) | Name::Process(id) | Name::Socket(id) | Name::Temporary(id) => (id, 0),
-        Name::Domain => (Id(0), 0),
+        Name::Entries(id)
+        | Name::Process(id)
+        | Name::Socket(id)
+        | Name::Counts(id)
+        | Name::Temporary(id) => (id, 0),
+        Name::Domain | Name::Ended => (Id(0), 0),
     };
     (u128::from(id) | u128::from(kind) << 64).to_le_bytes()
 }
@@ -574,7 +598,7 @@ fn modified(stat: &Stat) -> (i64, u64) {
     (stat.st_mtime, stat.st_mtime_nsec.into())
 }
 
-/// Maximum number of files in a directory: five per process, for more processes than a host runs.
+/// Maximum number of files in a directory: six per process, for more processes than a host runs.
 const MAX_FILES: usize = 100_000;
 
 /// The turn to wait for the lock of the domain; dropping it releases the turn.
@@ -666,22 +690,28 @@ impl Guard<'_> {
         let mut living = std::collections::HashMap::new();
         for name in self.host_dir.names()? {
             let id = match name {
-                Name::Domain => continue,
+                Name::Domain | Name::Ended => continue,
                 // No process is about to rename it: that happens under this lock only. A process that creates the
                 // lock file tolerates the removal.
                 Name::Temporary(_) => {
                     self.host_dir.remove(name)?;
                     continue;
                 }
-                Name::Process(id) | Name::Entries(id) | Name::Remote(id) | Name::Socket(id) => id,
+                Name::Process(id)
+                | Name::Entries(id)
+                | Name::Remote(id)
+                | Name::Socket(id)
+                | Name::Counts(id) => id,
             };
             let lives = match living.get(&id) {
                 Some(lives) => *lives,
                 None => self.host_dir.is_running(id)?,
             };
             living.insert(id, lives);
-            if !lives {
-                self.host_dir.remove(name)?;
+            match name {
+                _ if lives => {}
+                Name::Counts(id) => self.keep_counts(id)?,
+                name => self.host_dir.remove(name)?,
             }
         }
         Ok(living.values().filter(|lives| **lives).count())
@@ -692,6 +722,7 @@ impl Guard<'_> {
         self.host_dir.remove(Name::Entries(id))?;
         self.host_dir.remove(Name::Remote(id))?;
         self.host_dir.remove(Name::Socket(id))?;
+        self.keep_counts(id)?;
         self.host_dir.remove(Name::Temporary(id))?;
         self.host_dir.remove(Name::Process(id))
     }
@@ -702,6 +733,7 @@ impl Guard<'_> {
         // Last, because the lock shows that this process is running.
         drop(self.host_dir.process.lock().take());
         if self.sweep()? == 0 && self.is_current()? {
+            self.host_dir.remove(Name::Ended)?;
             self.host_dir.remove(Name::Domain)?;
         }
         Ok(())
@@ -774,6 +806,8 @@ mod tests {
             Name::Entries(id),
             Name::Remote(id),
             Name::Socket(id),
+            Name::Counts(id),
+            Name::Ended,
             Name::Temporary(id),
         ] {
             assert_eq!(Name::parse(&name.to_string()), Some(name));

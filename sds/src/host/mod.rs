@@ -14,6 +14,7 @@
 //! Nothing about the network belongs here. A gateway publishes the agents of other hosts here.
 
 mod cancellation;
+mod counts;
 mod file;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
@@ -23,6 +24,7 @@ mod shared;
 mod socket;
 mod watcher;
 
+use std::fs::File;
 use std::io;
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
@@ -30,6 +32,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_acl::ErrorChain;
+use fipa_transport::counts::Totals;
 use fipa_transport::{DirectoryError, DomainUsers, Forked, Incarnation, OwnerProcess, log_limit};
 use inotify::{WatchMask, Watches};
 use parking_lot::Mutex;
@@ -229,6 +232,25 @@ impl HostDirectory {
     #[must_use]
     pub fn departures(&self) -> Departures {
         Departures(self.shared.departures())
+    }
+
+    /// Creates the file in which this process counts, with these values: [`Counts`](fipa_transport::counts::Counts), in memory that is a shared mapping
+    /// of it. Call it again after [`rejoin`](Self::rejoin).
+    ///
+    /// # Errors
+    /// Fails when the directory was closed, or the file cannot be written.
+    pub fn create_counts(&self, values: &Totals) -> Result<File, HostError> {
+        self.owner.check()?;
+        self.shared.host_dir().lock()?.create_counts(values)
+    }
+
+    /// Returns the sum of the counters of all processes of the domain on this host, running or not. Takes system calls,
+    /// but wakes no process.
+    ///
+    /// # Errors
+    /// Fails when the files cannot be read.
+    pub fn sum_counts(&self) -> Result<Totals, HostError> {
+        self.shared.host_dir().sum_counts()
     }
 
     /// Opens a socket at which other processes of the domain can connect to this one: listening,

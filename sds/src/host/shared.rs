@@ -144,6 +144,8 @@ impl Shared {
             return Ok(false);
         }
         let before = self.host_dir();
+        // The process counts on in a new file with the same values, so those of this one are not kept.
+        before.remove(Name::Counts(before.id()))?;
         let host_dir = Arc::new(HostDir::join(
             before.path(),
             before.users(),

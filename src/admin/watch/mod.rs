@@ -92,7 +92,7 @@ impl Watcher {
             Wish { content },
             sender,
         ));
-        let maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host));
+        let maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host), None);
         let mut watcher = Self {
             events,
             joiner: Joiner::new(),

@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use fipa_sds::Entry;
+use fipa_transport::counts::Event;
 use fipa_transport::{
     Answer, AttemptId, Conclusion, FailureReason, Hop, Incarnation, Kind, Location, Outcome,
     Report, Signature, TransportError, TransportErrorKind,
@@ -285,6 +286,7 @@ impl Lane {
         (error, cause): (TransportError, Cause),
         table: &mut LaneTable,
     ) {
+        table.counts().event(Event::FailedAttempt, 1);
         if let Some(tally) = self.tally() {
             tally.fail(now, &error);
         }

@@ -820,7 +820,8 @@ impl Lane {
             _ => {}
         }
         let stream = self.stream_of(&open_letter);
-        table.settle(open_letter, stream, Arc::clone(&self.receiver), settlement);
+        let receiver = Arc::clone(&self.receiver);
+        table.settle(now, open_letter, stream, receiver, settlement);
     }
 
     /// Sends the custodian of the letter at `index` its new predecessor, after the letter before it
