@@ -128,6 +128,29 @@ fn letters_of_all_processes_are_counted_and_stay_counted_when_these_end() {
 }
 
 #[test]
+fn counters_survive_the_removal_of_their_files() {
+    let host = Host::new();
+    let shown = Shown::start(&host, "127.0.0.1:0");
+    let mut echo = host.echo("echo");
+    let ping = ["ping", "echo", "--count", "10", "--interval", "1ms"];
+    host.run(&ping).done();
+    let received = letters("received", "shm", "delivered");
+    let before = shown.values()[&received];
+    let directory = host.path("run").join(&host.domain).join("directory");
+    let files = fs::read_dir(&directory)
+        .unwrap()
+        .map(|file| file.unwrap().path());
+    let counts = files.filter(|file| file.to_string_lossy().ends_with(".counts"));
+    for file in counts.collect::<Vec<_>>() {
+        fs::remove_file(file).unwrap();
+    }
+    echo.wait_for_log(&["joined the domain", "again"]);
+    host.run(&ping).done();
+    let after = shown.values()[&received];
+    assert!(after >= before + 10.0, "{before} {after}");
+}
+
+#[test]
 fn violations_are_counted_by_protocol() {
     let host = Host::new();
     let shown = Shown::start(&host, "[::1]:0");
