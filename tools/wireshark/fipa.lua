@@ -9,6 +9,7 @@
 -- read, nesting and the number of items are bounded, and texts are escaped before they are shown.
 
 local fipa = Proto("fipa", "FIPA letters")
+local streams_of_quic = Proto("fipa_quic", "FIPA letters, streams of QUIC")
 local message_only = Proto("fipa_acl", "FIPA ACL message")
 
 -- Layout of transport-net/src/stream/frame, transport-net/src/udp/packet.rs and transport/src/wire.
@@ -666,12 +667,14 @@ function Reader:agents(tree, field, notation)
     return names
 end
 
--- Shows a content at this range: as text if it is printable, else as bytes.
-local function show_content(tree, tvb, at, len)
+-- Shows a content at this range: as text if it is printable, else as bytes. `whole` is its length if the capture has
+-- only a part of it.
+local function show_content(tree, tvb, at, len, whole)
     if not tree then
         return
     end
-    tree:add(F.content_length, UInt64.new(len % 4294967296, math.floor(len / 4294967296))):set_generated()
+    whole = whole or len
+    tree:add(F.content_length, UInt64.new(whole % 4294967296, math.floor(whole / 4294967296))):set_generated()
     if len == 0 then
         return
     end
@@ -680,7 +683,7 @@ local function show_content(tree, tvb, at, len)
         return
     end
     local bytes = tvb:raw(at, limit)
-    local cut = limit < len
+    local cut = limit < whole
     if cut then
         -- A character may be cut.
         bytes = bytes:gsub("[\xC2-\xF4][\x80-\xBF]?[\x80-\xBF]?$", "")
@@ -753,6 +756,11 @@ local function bit_efficient(self, tree)
             if form == 0x16 or form == 0x17 or form == 0x19 then
                 len = len_of_string(self, form, "content")
                 at = self.at
+                if len > self:left() and self.is_cut then
+                    found.content_length = len
+                    show_content(tree, self.tvb, at, self:left(), len)
+                    return found
+                end
                 self:skip(len, "content")
             elseif form == 0x14 then
                 at = self.at
@@ -1134,10 +1142,13 @@ local function summary(found)
 end
 
 -- Shows a message and what of it is not dissected. Returns its summary.
-local function show_message(tvb, tree, at, stop)
+local function show_message(tvb, tree, at, stop, is_cut)
     local range = tvb:range(at, stop - at)
     local branch = subtree(tree, range, "Message")
-    local found, problem = guarded(branch, message, reader(tvb, at, stop), branch)
+    local self = reader(tvb, at, stop)
+    -- The capture lacks the rest.
+    self.is_cut = is_cut
+    local found, problem = guarded(branch, message, self, branch)
     if not found then
         return "malformed message: " .. problem, true
     end
@@ -1244,8 +1255,8 @@ local function parcel(self, tree, parent)
     end
     self.at = at + PARCEL_HEADER
     local announced = name_len + envelope_len + head_len + tail_len + content_len
-    if announced ~= self:left() then
-        malformed(("parcel announces %.0f bytes, and there are %d"):format(announced, self:left()), announced > self:left())
+    if announced ~= self:left() and not (self.is_cut and announced > self:left()) then
+        malformed(("parcel announces %.0f bytes, and there are %d"):format(announced, self:left()))
     end
     local start = self.at
     local receiver = self:take(name_len, "receiving agent")
@@ -1265,9 +1276,13 @@ local function parcel(self, tree, parent)
     local stop = start + envelope_len
     guarded(parent, envelope, reader(tvb, start, stop), parent)
     if stop >= self.stop then
+        local is_cut = self.is_cut and head_len + tail_len + content_len > 0
+        if is_cut then
+            return "letter for " .. brief(receiver) .. ", cut off"
+        end
         return "letter for " .. brief(receiver) .. " without a message"
     end
-    return (show_message(tvb, parent, stop, self.stop))
+    return (show_message(tvb, parent, stop, self.stop, self.is_cut))
 end
 
 local function hello(self, tree)
@@ -1350,6 +1365,7 @@ local function frame(tvb, root, at, stop, announced)
     local name = FRAME_KINDS[kind] or ("frame of kind " .. kind)
     self.at = at + FRAME_HEADER
     if announced > self:left() then
+        self.is_cut = true
         tree:add_proto_expert_info(E.note, ("the frame has %.0f bytes, of which %d are there"):format(announced, self:left()))
     end
     local text, problem
@@ -1412,7 +1428,14 @@ local function wait_for(pinfo, at, len)
     pinfo.desegment_len = len
 end
 
+local UDP = 3
+
+-- Whether the dissector gets the bytes again when more have arrived. Wireshark 4.0 does not reassemble the streams of
+-- QUIC for dissectors in Lua.
 local function can_wait(tvb, pinfo)
+    if pinfo.port_type == UDP then
+        return false
+    end
     local can = pinfo.can_desegment
     return can and can ~= 0 and tvb:len() == tvb:reported_len()
 end
@@ -1668,21 +1691,20 @@ end
 
 local dissect_stream, dissect_datagram, dissect_letters = entry(stream), entry(datagram), entry(letters)
 
-local UDP = 3
-
--- Called for "Decode as", and for the streams of QUIC, whose ports are those of UDP.
+-- Called for "Decode as", and for conversations that a heuristic has recognized.
 function fipa.dissector(tvb, pinfo, root)
+    if pinfo.port_type == UDP then
+        return dissect_datagram(tvb, pinfo, root)
+    end
     local first = tvb:len() > 0 and tvb:raw(0, 1):byte()
     if first == 0xfd or first == 0xfe then
         return dissect_letters(tvb, pinfo, root)
     end
-    local is_datagram = pinfo.port_type == UDP and not pinfo.private["fipa_stream"] and tvb:len() >= DATAGRAM_HEADER
-    -- A data packet has no length where a frame has one, and a stream of QUIC begins with a frame.
-    if is_datagram and not (pinfo.can_desegment and pinfo.can_desegment ~= 0) then
-        return dissect_datagram(tvb, pinfo, root)
-    end
     return dissect_stream(tvb, pinfo, root)
 end
+
+-- A protocol of its own, because the ports of QUIC are those of UDP.
+streams_of_quic.dissector = dissect_stream
 
 -- The message of a letter over HTTP, a part of a multipart body (FIPA00084).
 function message_only.dissector(tvb, pinfo, root)
@@ -1751,6 +1773,5 @@ end
 offer("tcp.port", nil, fipa)
 offer("udp.port", nil, fipa)
 offer("tls.port", nil, fipa)
-offer("tls.alpn", "fipa/1", fipa)
-offer("quic.proto", "fipa/1", fipa)
+offer("quic.proto", "fipa/1", streams_of_quic)
 offer("media_type", "application/text", message_only)
