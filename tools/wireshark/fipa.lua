@@ -1075,8 +1075,8 @@ local function envelope_parameters(self, tree, found)
 end
 
 -- All envelopes of a letter. Returns what the letter needs of them.
-local function envelope(self, tree)
-    local found = {}
+local function envelope(self, tree, found)
+    found = found or {}
     for _ = 1, 1024 do
         local start = self.at
         local code = self:byte("envelope")
@@ -1099,6 +1099,7 @@ local function envelope(self, tree)
             self:take_if(0x0a)
             stamp(self, branch)
         end
+        found.has_date = true
         envelope_parameters(self, branch, found)
         if branch then
             branch:set_len(self.at - start)
@@ -1528,17 +1529,15 @@ local function letters(tvb, pinfo, root)
     return size
 end
 
--- Whether the bytes begin a letter without a frame: at least the first stamp, or representation and date, must fit.
+-- Whether the bytes begin a letter without a frame: at least the first stamp, or representation and date, are there.
 local function begins_letter(tvb)
-    if tvb:len() < 20 then
-        return false
-    end
     local first = tvb:raw(0, 1):byte()
     if first ~= 0xfd and first ~= 0xfe then
         return false
     end
-    local done, failure = pcall(envelope, reader(tvb, 0, tvb:len()), nil)
-    return done or (is_malformed(failure) and failure.is_short and tvb:len() >= 64) or false
+    local found = {}
+    local done, failure = pcall(envelope, reader(tvb, 0, tvb:len()), nil, found)
+    return done or (found.has_date and is_malformed(failure) and failure.is_short) or false
 end
 
 ---------------------------------------------------------------------------------------------------------------------
