@@ -641,6 +641,8 @@ fn damaged_captures_cause_no_error_of_the_dissector() {
                 panic!("{wrong}, seed {SEED}: {}", &text[from..to]);
             }
         }
+        let faults = fields(&broken, options, "fipa.fault", &["frame.number"]);
+        assert!(faults.is_empty(), "{faults:?}");
         let malformed = fields(&broken, options, "fipa.malformed", &["frame.number"]);
         assert!(
             malformed.len() > DAMAGED / 20,

@@ -232,7 +232,7 @@ local function guarded(tree, work, ...)
         return result
     end
     local is_ours = is_malformed(result)
-    local problem = is_ours and result.problem or tostring(result)
+    local problem = is_ours and result.problem or "Fault of the dissector: " .. tostring(result)
     if tree then
         tree:add_proto_expert_info(is_ours and E.malformed or E.fault, problem)
     end
@@ -1682,7 +1682,7 @@ local function entry(work)
         if is_malformed(result) then
             tree:add_proto_expert_info(E.malformed, result.problem)
         else
-            tree:add_proto_expert_info(E.fault, tostring(result))
+            tree:add_proto_expert_info(E.fault, "Fault of the dissector: " .. tostring(result))
         end
         return tvb:len()
     end
