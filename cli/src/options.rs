@@ -201,8 +201,13 @@ pub(crate) struct Global {
     quiet: bool,
 
     /// Format of the log on standard error [default: text]
-    #[arg(long, value_name = "FORMAT", help_heading = "Global options", hide_possible_values = true,
-          long_help = "Format of the log on standard error: text, or json for one object per line [default: text]")]
+    #[arg(
+        long,
+        value_name = "FORMAT",
+        help_heading = "Global options",
+        hide_possible_values = true,
+        long_help = "Format of the log on standard error: text, or json for one object per line [default: text]"
+    )]
     pub(crate) log_format: Option<LogFormat>,
 }
 

@@ -9,6 +9,7 @@ use super::News;
 use super::action::Action;
 use super::lane::OpenLetter;
 use super::lane_table::LaneTable;
+use super::letter_log::{LetterId, letter_debug};
 use super::notes::{Note, note_parcel};
 use super::origin::{Origin, Settlement, Upstream};
 
@@ -28,6 +29,7 @@ impl LaneTable {
             ..
         } = *open_letter;
         if let Settlement::Outcome(outcome) = &settlement {
+            letter_debug!(LetterId::new(stream, sequence), %receiver, %outcome, "settled");
             self.notice(stream, sequence, &receiver, || News::Settled {
                 outcome: outcome.clone(),
                 sender: !matches!(origin, Origin::Forwarded { .. }),

@@ -11,6 +11,7 @@ use super::action::Action;
 use super::ids::{SubmissionId, registration_of};
 use super::lane::OpenLetter;
 use super::lanes::own_lane;
+use super::letter_log::{LetterId, letter_debug};
 use super::origin::Origin;
 use super::undelivered::{FailureTarget, Undelivered};
 use super::waiting::Unresolved;
@@ -351,6 +352,7 @@ impl Core {
             return self.undeliverable(submission, sender, Arc::clone(name), letter, reason);
         }
         let sequence = self.sequence_of(sender);
+        letter_debug!(LetterId::new(stream, sequence), receiver = %name, bytes = letter.len(), "sent");
         self.table.notice(stream, sequence, name, || News::Sent {
             submission: Some(submission),
             letter: letter.clone(),
