@@ -553,6 +553,67 @@ fn sent_by_a_gateway(kind: &'static str, protocol: &str) -> Vec<Vec<u8>> {
     payloads(&capture, protocol, &port)
 }
 
+/// Recorded requests of JADE, with the encoding of the message in each.
+const REQUESTS: [(&str, &[u8]); 3] = [
+    (
+        "string",
+        include_bytes!(
+            "../../transport-net/tests/data/jade_http/string.3-echo-reply-from-jade.bin"
+        ),
+    ),
+    (
+        "XML",
+        include_bytes!("../../transport-net/tests/data/jade_http/xml.3-echo-reply-from-jade.bin"),
+    ),
+    (
+        "bit-efficient",
+        include_bytes!(
+            "../../transport-net/tests/data/jade_http/bitefficient.3-echo-reply-from-jade.bin"
+        ),
+    ),
+];
+
+#[test]
+fn messages_over_http_are_dissected_in_every_encoding() {
+    if !can_run(
+        "messages_over_http_are_dissected_in_every_encoding",
+        &["tshark"],
+        true,
+    ) {
+        return;
+    }
+    let mut random = Rng::with_seed(SEED);
+    let mut written = Written::new();
+    for (from, (_, request)) in (10_000..).zip(REQUESTS) {
+        written.stream(from, request, &mut random);
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("http.pcap");
+    fs::write(&capture, written.0).unwrap();
+    let decoded = format!("tcp.port=={PORT},http");
+    let compared = [
+        "fipa.encoding",
+        "fipa.performative",
+        "fipa.sender",
+        "fipa.receiver",
+        "fipa.conversation_id",
+        "fipa.content",
+    ];
+    let found = fields(&capture, &["-d", &decoded], "fipa", &compared);
+    let expected = REQUESTS.map(|(encoding, _)| {
+        json!({
+            "fipa.encoding": [encoding],
+            "fipa.performative": ["inform"],
+            "fipa.sender": ["echo@jadetest"],
+            "fipa.receiver": ["rusty@rustap"],
+            "fipa.conversation_id": ["conv-1"],
+            "fipa.content": ["hello jade"],
+        })
+    });
+    let found: Vec<Value> = found.into_iter().map(Value::from).collect();
+    assert_eq!(found, expected);
+}
+
 #[test]
 fn damaged_captures_cause_no_error_of_the_dissector() {
     if !is_possible("damaged_captures_cause_no_error_of_the_dissector") {

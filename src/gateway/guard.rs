@@ -35,7 +35,7 @@ fn log_keys(security: &Security, path: Option<&OsStr>) -> Result<(), OpenError> 
     let logging = security.log_keys(key_log);
     logging.map_err(|error| OpenError::Keys(error.into()))?;
     log_limit::warn!(
-        ?path,
+        path = %path.display(),
         "the secrets of TLS connections are written to the key log: everyone who reads this file can decrypt captured \
          letters; remove security.key_log and the file after the capture"
     );

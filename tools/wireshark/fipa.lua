@@ -175,9 +175,9 @@ fipa.prefs.max_content = Pref.uint("Shown bytes of a content", 4096, "Longer con
 
 local Malformed = {}
 
--- Ends the dissection of the current part.
-local function malformed(problem, is_short)
-    error(setmetatable({ problem = problem, is_short = is_short }, Malformed), 0)
+-- Ends the dissection of the current part. `is_short` says that it lacks bytes, `missing` how many, if that is known.
+local function malformed(problem, is_short, missing)
+    error(setmetatable({ problem = problem, is_short = is_short, missing = missing }, Malformed), 0)
 end
 
 local function is_malformed(failure)
@@ -915,7 +915,8 @@ local function xml_message(self, tree)
     end
     local head = text:sub(first, last)
     local found = { receivers = {}, content_length = 0 }
-    found.performative = unescaped(head:match('%sact%s*=%s*"([^"]*)"') or malformed("a message without act"))
+    local act = head:match('%sact%s*=%s*"([^"]*)"') or malformed("a message without act")
+    found.performative = unescaped(act):lower()
     item(tree, F.performative, self:range(base_at + first - 1, last - first + 1), shown(found.performative))
     local at = last + 1
     while true do
@@ -1367,7 +1368,8 @@ local function frame(tvb, root, at, stop, announced)
     self.at = at + FRAME_HEADER
     if announced > self:left() then
         self.is_cut = true
-        tree:add_proto_expert_info(E.note, ("the frame has %.0f bytes, of which %d are there"):format(announced, self:left()))
+        local note = "the frame has %.0f bytes, of which %d are there"
+        tree:add_proto_expert_info(E.note, note:format(announced, self:left()))
     end
     local text, problem
     if kind == 2 then
@@ -1493,7 +1495,7 @@ local function bare_letter(tvb, tree, at)
         message(ahead, nil)
         stop = ahead.at
     elseif stop > tvb:len() then
-        error(setmetatable({ problem = "letter is cut off", is_short = true, missing = stop - tvb:len() }, Malformed), 0)
+        malformed("letter is cut off", true, stop - tvb:len())
     end
     local text = "letter without a message"
     if stop > self.at then

@@ -23,7 +23,7 @@ pub struct KeyLog {
 #[non_exhaustive]
 pub enum KeyLogError {
     /// The file cannot be opened or created.
-    #[error("cannot open the key log {path:?}")]
+    #[error("cannot open the key log {}", .path.display())]
     Open {
         /// The file.
         path: PathBuf,
@@ -31,10 +31,13 @@ pub enum KeyLogError {
         source: io::Error,
     },
     /// The file is not a regular file.
-    #[error("the key log {0:?} is not a regular file")]
+    #[error("the key log {} is not a regular file", .0.display())]
     NotAFile(PathBuf),
     /// Other users may read the file, or it belongs to one.
-    #[error("other users can read the key log {path:?}: its owner is {owner} and its mode {mode:03o}; remove the file")]
+    #[error(
+        "other users can read the key log {}: its owner is {owner} and its mode {mode:03o}; remove the file",
+        .path.display()
+    )]
     Exposed {
         /// The file.
         path: PathBuf,
@@ -107,7 +110,7 @@ impl rustls::KeyLog for KeyLog {
         // One call for each line: lines of several threads and processes do not mix.
         let line = line(label, client_random, secret);
         if let Err(error) = (&self.file).write_all(line.as_bytes()) {
-            log_limit::error!(path = ?self.path, %error, "cannot write a secret to the key log");
+            log_limit::error!(path = %self.path.display(), %error, "cannot write a secret to the key log");
         }
     }
 }
@@ -144,7 +147,10 @@ mod tests {
         fs::write(&open, "").unwrap();
         fs::set_permissions(&open, fs::Permissions::from_mode(0o640)).unwrap();
         let refused = KeyLog::append_to(&open).unwrap_err();
-        assert!(matches!(refused, KeyLogError::Exposed { mode: 0o640, .. }), "{refused:?}");
+        assert!(
+            matches!(refused, KeyLogError::Exposed { mode: 0o640, .. }),
+            "{refused:?}"
+        );
         let link = dir.path().join("link.log");
         symlink(dir.path().join("elsewhere"), &link).unwrap();
         let refused = KeyLog::append_to(&link).unwrap_err();
