@@ -17,6 +17,7 @@ use tokio::time::MissedTickBehavior;
 use super::Arguments;
 use super::file::writer::Split;
 use super::recorder::{Counts, Directory, Observation, Recorder, Settings};
+use super::topics::Topics;
 use crate::command::watch::TICK;
 use crate::command::watch::checker::{self, Checker};
 use crate::membership::{self, Stop};
@@ -87,6 +88,10 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
     let path = input::name(&settings.split.path);
     let first = recording.known.changes(&watcher).unwrap_or_default();
     let recorder = Recorder::create(settings, first, Arc::clone(&recording.counts))?;
+    let topics = Topics::join(&arguments.topics, config).await?;
+    // The values of topics are recorded once, and not as letters, too.
+    let own = topics.as_ref().map(Topics::name);
+    let recorder = recorder.without(own);
     let (sender, observations) = mpsc::channel(MAX_WAITING);
     let writing = tokio::task::spawn_blocking(move || recorder.run(observations));
     recording.begin(arguments, &path, &config.domain, watcher.processes())?;
@@ -95,6 +100,7 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
         let mut over = pin!(options::after(arguments.time));
         tokio::select! {
             () = recording.observe(&mut watcher, &sender) => {}
+            () = follow(topics.as_ref(), &sender) => {}
             () = &mut stopped => {}
             () = &mut over => {}
         }
@@ -105,6 +111,9 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
         let _ = sender.send(Observation::Event(event)).await;
     }
     drop((sender, watcher));
+    if let Some(topics) = topics {
+        topics.leave().await;
+    }
     let written = writing.await;
     recording.progress.finish_and_clear();
     written.map_err(|error| {
@@ -112,6 +121,14 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
         Failure::failed(error.to_string(), path, help)
     })??;
     recording.end(arguments)
+}
+
+/// Forwards the values of topics. Does not return without topics.
+async fn follow(topics: Option<&Topics>, sender: &Sender<Observation>) {
+    match topics {
+        Some(topics) => topics.run(sender).await,
+        None => std::future::pending().await,
+    }
 }
 
 /// The course of a recording.

@@ -4,6 +4,7 @@ mod capture;
 pub(super) mod file;
 mod recorder;
 pub(super) mod tools;
+mod topics;
 
 use std::path::PathBuf;
 use std::time::Duration;

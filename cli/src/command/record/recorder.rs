@@ -96,6 +96,8 @@ pub(super) struct Recorder {
     finished: u64,
     /// Whether letters before the next one are missing.
     after_loss: bool,
+    /// The agent of this command, whose letters are not recorded.
+    own: Option<String>,
 }
 
 /// The file that is being written.
@@ -161,10 +163,23 @@ impl Recorder {
             open: None,
             finished: 0,
             after_loss: false,
+            own: None,
         };
         recorder.earlier.add_entries(&recorder.directory);
         recorder.open()?;
         Ok(recorder)
+    }
+
+    /// Leaves out the letters of the agent of this command.
+    pub(super) fn without(mut self, own: Option<String>) -> Self {
+        self.own = own;
+        self
+    }
+
+    /// Whether the agent of this command has sent or received a letter.
+    fn is_own(&self, passage: &Passage) -> bool {
+        let own = self.own.as_deref();
+        own.is_some_and(|own| passage.sender() == Some(own) || *passage.receiver == *own)
     }
 
     /// Writes all observations until the senders are dropped, and closes the file.
@@ -250,7 +265,7 @@ impl Recorder {
         // Every letter is checked, whether recorded or not: the state of a conversation depends on all its letters.
         let observed = Letter::of(passage, &self.earlier);
         let checked = self.checker.check(Letter::of(passage, &self.earlier));
-        if !self.filter.takes(passage, &checked) {
+        if !self.filter.takes(passage, &checked) || self.is_own(passage) {
             return Ok(());
         }
         let json = letter::to_json(passage, &checked, &observed, self.after_loss);
@@ -327,7 +342,10 @@ impl Recorder {
 
     fn later(&mut self, passage: &Passage) -> Result<(), Failure> {
         // A violation was recorded with its letter.
-        if self.filter.violations || !self.filter.takes(passage, &CheckResult::Checked) {
+        if self.filter.violations
+            || !self.filter.takes(passage, &CheckResult::Checked)
+            || self.is_own(passage)
+        {
             return Ok(());
         }
         let object = json::later_object(passage);

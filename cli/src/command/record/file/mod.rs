@@ -14,6 +14,7 @@
 //! `check` has the data of a letter that its check needs beside the message: see [`letter`]. The metadata record
 //! [`ABOUT`] is at the beginning of a file, [`TOTALS`] at its end.
 
+mod fields;
 pub(in crate::command) mod letter;
 pub(in crate::command) mod reader;
 pub(in crate::command) mod writer;
@@ -78,6 +79,9 @@ pub(in crate::command) enum RecordingError {
     /// The file is no recording, or a record is malformed.
     #[error(transparent)]
     Mcap(#[from] mcap::McapError),
+    /// A record is malformed.
+    #[error("a record with the opcode {0} is malformed")]
+    Malformed(u8),
     /// The schemas and channels exceed a limit.
     #[error("the channels and schemas have more than {0} bytes")]
     TooManyChannels(usize),

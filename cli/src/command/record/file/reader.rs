@@ -3,14 +3,14 @@
 //! A file comes from outside. The records and the chunks of a file, before and after decompression, have a maximum
 //! length, which is checked before memory is taken. The messages of a chunk are read after its checksum is verified.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::io::{self, ErrorKind, Read};
 
 use mcap::McapError;
-use mcap::records::{Channel, MessageHeader, Metadata, Record, SchemaHeader, op};
+use mcap::records::{Channel, MessageHeader, Metadata, SchemaHeader, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
-use super::RecordingError;
+use super::{RecordingError, fields};
 use crate::report::Failure;
 
 /// Maximum length of a record, and of a chunk before and after decompression, in bytes.
@@ -118,32 +118,31 @@ impl Known {
         opcode: u8,
         data: &'a [u8],
     ) -> Result<Option<Item<'a>>, RecordingError> {
-        // Other records are not parsed.
-        if !matches!(
-            opcode,
-            op::SCHEMA | op::CHANNEL | op::MESSAGE | op::METADATA
-        ) {
-            return Ok(None);
-        }
-        match mcap::parse_record(opcode, data)? {
-            // A repetition has the same data.
-            Record::Schema { header, data } if !self.schemas.contains_key(&header.id) => {
-                self.count(data.len())?;
-                let data = data.into_owned();
-                self.schemas.insert(header.id, FileSchema { header, data });
+        let malformed = || RecordingError::Malformed(opcode);
+        match opcode {
+            op::SCHEMA => {
+                let (header, text) = fields::schema(data).ok_or_else(malformed)?;
+                // A repetition has the same data.
+                if !self.schemas.contains_key(&header.id) {
+                    self.count(data.len())?;
+                    let data = text.to_vec();
+                    self.schemas.insert(header.id, FileSchema { header, data });
+                }
                 Ok(None)
             }
-            Record::Channel(channel) if !self.channels.contains_key(&channel.id) => {
-                self.count(data.len())?;
-                self.channels.insert(channel.id, channel);
+            op::CHANNEL => {
+                let channel = fields::channel(data).ok_or_else(malformed)?;
+                if !self.channels.contains_key(&channel.id) {
+                    self.count(data.len())?;
+                    self.channels.insert(channel.id, channel);
+                }
                 Ok(None)
             }
-            Record::Message { header, .. } => {
+            op::MESSAGE => {
+                let (header, data) = fields::message(data).ok_or_else(malformed)?;
                 let id = header.channel_id;
                 let channel = self.channels.get(&id);
                 let channel = channel.ok_or(RecordingError::UnknownChannel(id))?;
-                // The header of a message has this length.
-                let data = data.get(2 + 4 + 8 + 8..).unwrap_or_default();
                 Ok(Some(Item::Message {
                     channel,
                     schema: self.schemas.get(&channel.schema_id),
@@ -151,7 +150,11 @@ impl Known {
                     data,
                 }))
             }
-            Record::Metadata(metadata) => Ok(Some(Item::Metadata(metadata))),
+            op::METADATA => {
+                let metadata = fields::metadata(data).ok_or_else(malformed)?;
+                Ok(Some(Item::Metadata(metadata)))
+            }
+            // Other records are not parsed.
             _ => Ok(None),
         }
     }
@@ -163,12 +166,4 @@ impl Known {
             false => Ok(()),
         }
     }
-}
-
-/// Text of a metadata record.
-pub(in crate::command) fn text<'a>(
-    map: &'a BTreeMap<String, String>,
-    key: &str,
-) -> Option<&'a str> {
-    map.get(key).map(String::as_str)
 }
