@@ -559,33 +559,31 @@ fn lost_records_are_in_the_file() {
     let mut rover = host.ordered_agent("rover", &[]);
     let _arm = host.ordered_agent("arm_1", &[]);
     let recording = record(&host, &["-o", text(&file)]);
-    let mut converse = |act: &str| {
-        let order = json!({
-            "do": "converse", "performative": act, "to": "arm_1", "conversation": "c1"
-        });
+    let mut order = |order: Value, answer: &str| {
         rover.write_line(&order.to_string());
-        while !rover.line().contains("outcomes") {}
+        while !rover.line().contains(answer) {}
     };
-    converse("cfp");
+    let converse = |act: &str| json!({ "do": "converse", "performative": act, "to": "arm_1", "conversation": "c1" });
+    order(converse("cfp"), "outcomes");
     let recorded = || messages(&host, &file, &[]);
     fipa_testbed::until("the first letter is in the file", || {
         letters(&recorded()).len() == 1
     });
     recording.send_signal("-STOP");
     // More than the queues of the processes hold.
-    send(
-        &host,
-        "send --from crane --to arm_1 --content x --rate 10000 --count 6000",
+    order(
+        json!({ "do": "measure", "to": "arm_1", "len": 9, "rounds": 4000 }),
+        "measured",
     );
     recording.send_signal("-CONT");
     let is_lost = |it: &Value| it["message"]["event"] == "lost";
     fipa_testbed::until("the loss is in the file", || recorded().iter().any(is_lost));
     // Its answer would be a violation if the conversation were known.
-    converse("inform");
+    order(converse("inform"), "outcomes");
     fipa_testbed::until("the last letter is in the file", || {
         let all = recorded();
-        let last = |it: &&Value| it["sender"] == "rover" && it["performative"] == "inform";
-        letters(&all).into_iter().any(|it| last(&it))
+        let last = |it: &Value| it["conversation_id"] == "c1" && it["performative"] == "inform";
+        letters(&all).into_iter().any(last)
     });
     let summary = end(recording);
     let lost = summary["lost"].as_u64().unwrap();

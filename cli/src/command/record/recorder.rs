@@ -6,14 +6,15 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use fipa::Entry;
 use fipa::admin::watch::{Event, Passage};
-use fipa::{Entry, Performative};
-use fipa_acl::{escape, escape_name};
+use fipa_acl::escape;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
 use super::file::writer::{RecordingFile, Split, Stamp, Syncer, Target};
 use super::file::{self, RecordingError, letter};
+use super::locks::Grants;
 use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
 use crate::command::watch::filter::Filter;
 use crate::command::watch::{OBSERVATION_DELAY, json};
@@ -88,6 +89,7 @@ pub(super) struct Recorder {
     about: BTreeMap<String, String>,
     checker: Checker,
     earlier: Earlier,
+    grants: Grants,
     directory: Arc<[Arc<Entry>]>,
     counts: Arc<Counts>,
     syncer: Syncer,
@@ -157,6 +159,7 @@ impl Recorder {
             about: settings.about,
             checker: settings.checker,
             earlier: Earlier::default(),
+            grants: Grants::default(),
             directory: directory.entries,
             counts,
             syncer,
@@ -318,24 +321,13 @@ impl Recorder {
             self.event(passage.at, &event)?;
             self.log(passage.at, Level::Error, sender, &text)?;
         }
-        // The messages of locks have these protocols: `fipa_locking`.
-        let is_lock = |message: &fipa::Message| {
-            *message.performative() == Performative::Refuse
-                && message.protocol().is_some_and(|it| it.starts_with("dlm_"))
-        };
-        if passage.message.as_ref().is_some_and(is_lock) {
-            let reason = String::from_utf8_lossy(&passage.content).into_owned();
+        if let Some(lock) = self.grants.handle(passage) {
             let event = json!({
-                "event": "lock_refused", "number": passage.number, "sender": sender,
-                "receiver": *passage.receiver, "reason": reason,
+                "event": lock.event, "number": passage.number, "resource": lock.resource,
+                "name": lock.agent, "text": lock.text,
             });
             self.event(passage.at, &event)?;
-            let text = format!(
-                "refused a lock, or its extension, to {}: {}",
-                escape_name(&passage.receiver),
-                escape(&reason)
-            );
-            self.log(passage.at, Level::Warning, sender, &text)?;
+            self.log(passage.at, Level::Warning, &lock.agent, &lock.text)?;
         }
         Ok(())
     }
@@ -355,6 +347,7 @@ impl Recorder {
     fn lost(&mut self, process: &str, records: u64) -> Result<(), Failure> {
         self.earlier.add_entries(&self.directory);
         self.checker.forget();
+        self.grants.forget();
         self.after_loss = true;
         add(&self.counts.lost, records);
         self.open()?.totals.lost += records;

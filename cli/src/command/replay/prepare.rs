@@ -5,6 +5,7 @@ use std::time::{Duration, SystemTime};
 use fipa::locks::FENCE;
 use fipa::{Message, Performative, Time};
 use fipa_acl::json::message_from_json;
+use fipa_locking::codec::is_lock_protocol;
 use serde_json::{Value, json};
 
 use crate::command::record::file::letter::RecordedLetter;
@@ -46,11 +47,7 @@ fn effect(message: &Message) -> Option<&'static str> {
     if message.user_defined().iter().any(has_fence) {
         return Some("it has a fence");
     }
-    // The messages of locks have fences in their contents: `fipa_locking`.
-    if message
-        .protocol()
-        .is_some_and(|it| it.to_ascii_lowercase().starts_with("dlm_"))
-    {
+    if message.protocol().is_some_and(is_lock_protocol) {
         return Some("it belongs to a lock");
     }
     match message.performative() {
@@ -137,7 +134,7 @@ mod tests {
         fenced["user_defined"] = json!({ "fipa-fence": "dock 1" });
         assert_eq!(reason(&fenced, false), Some("it has a fence"));
         let mut lock = said("inform");
-        lock["protocol"] = "dlm_ricart_agrawala".into();
+        lock["protocol"] = "ricart_agrawala".into();
         assert_eq!(reason(&lock, false), Some("it belongs to a lock"));
         let mut cut = said("inform");
         cut.as_object_mut().unwrap().remove("content");

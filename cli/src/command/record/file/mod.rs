@@ -6,7 +6,7 @@
 //! | `/letters/<receiver>/raw` | the bytes of the letter, if all of them were observed |
 //! | `/letters`, `/letters/raw` | the letters of further receivers, after [`MAX_RECEIVERS`] |
 //! | `/events` | agents, later outcomes, violations, overdue messages and lost records as JSON |
-//! | `/log` | violations, lost records and refused locks as `foxglove.Log` |
+//! | `/log` | violations, lost records, lost and refused locks as `foxglove.Log` |
 //! | `/topics/<agent>/<topic>` | the values of a topic with the media type of the topic |
 //!
 //! The times of a letter are its time of sending. A letter and its bytes have the same sequence number.
