@@ -95,7 +95,9 @@ fn with_meant_command(mut error: clap::Error) -> clap::Error {
     };
     let tip = match word {
         "hz" | "bw" => Some("fipa subscribe NAME TOPIC --rate measures the rate of a topic"),
-        "bag" | "record" => Some("fipa watch --record FILE records letters"),
+        "bag" => Some(
+            "fipa record -o FILE records letters and topics, and fipa replay FILE replays them",
+        ),
         "service" | "services" | "call" => Some(
             "fipa request NAME CONTENT calls an agent, and fipa actions lists the actions of robots",
         ),
