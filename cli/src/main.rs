@@ -9,12 +9,13 @@
 //!   errors and signals.
 //! * [`complete`] completes command lines for shells.
 //! * [`report`] prints errors and warnings; [`output`] prints results; [`input`] reads files and
-//!   standard input.
+//!   standard input. [`log_output`] holds back texts for standard error while a command draws on the terminal.
 
 mod answers;
 mod command;
 mod complete;
 mod input;
+mod log_output;
 mod membership;
 mod options;
 mod output;
@@ -63,7 +64,7 @@ fn log_to_stderr(global: &options::Global) {
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_ansi(std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none())
-        .with_writer(std::io::stderr)
+        .with_writer(|| log_output::LogOutput)
         .fmt_fields(format::debug_fn(log_field))
         .init();
 }

@@ -507,7 +507,12 @@ mod tests {
         (config.monitor.check, config.monitor.answer) = (Check::Enforce, true);
         let rules = Rules::load(&config.monitor).unwrap();
         let directory = directory();
-        let checks = rules.checks("rover", "c-".to_owned(), &directory, Arc::new(Counts::default()));
+        let checks = rules.checks(
+            "rover",
+            "c-".to_owned(),
+            &directory,
+            Arc::new(Counts::default()),
+        );
         let received = received(&message, sender, Some(Kind::Tcp));
         let origin = Origin::of(&received);
         let incoming = Incoming::new(received).unwrap();
@@ -548,7 +553,12 @@ mod tests {
             config.monitor.check = Check::Enforce;
             let rules = Rules::load(&config.monitor).unwrap();
             let directory = directory();
-            let checks = rules.checks("rover", "c-".to_owned(), &directory, Arc::new(Counts::default()));
+            let checks = rules.checks(
+                "rover",
+                "c-".to_owned(),
+                &directory,
+                Arc::new(Counts::default()),
+            );
             let arrived = |message: &Message| {
                 let received = received_at(caller, message, ARM, Some(Kind::Tcp));
                 let origin = Origin::of(&received);

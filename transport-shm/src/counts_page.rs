@@ -94,11 +94,7 @@ mod tests {
     #[test]
     fn a_file_shows_the_counts_as_long_as_they_are_in_it() {
         let counted = |totals: &Totals| {
-            totals.letters(
-                Direction::Sent,
-                Some(Kind::Shm),
-                LetterOutcome::Delivered,
-            )
+            totals.letters(Direction::Sent, Some(Kind::Shm), LetterOutcome::Delivered)
         };
         let mut first = tempfile::tempfile().unwrap();
         assert!(CountsPage::map(&first).is_err(), "an empty file");

@@ -419,7 +419,12 @@ mod tests {
     fn a_page_of_another_layout_is_refused() {
         let page = Totals::default().to_page();
         assert_eq!(Totals::from_page(&page), Some(Totals::default()));
-        for wrong in [&page[1..], &page[..0], &[0; Counts::LEN], &[&page[..], &page].concat()] {
+        for wrong in [
+            &page[1..],
+            &page[..0],
+            &[0; Counts::LEN],
+            &[&page[..], &page].concat(),
+        ] {
             assert_eq!(Totals::from_page(wrong), None);
         }
     }

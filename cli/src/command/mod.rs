@@ -31,6 +31,7 @@ mod request;
 mod routes;
 mod send;
 mod subscribe;
+mod top;
 pub(crate) mod topics;
 mod up;
 mod watch;
@@ -65,6 +66,7 @@ pub(crate) enum Command {
     Routes(routes::Arguments),
     Reload(reload::Arguments),
     Watch(Box<watch::Arguments>),
+    Top(top::Arguments),
     Demo(demo::Arguments),
     Doctor(doctor::Arguments),
     #[cfg(feature = "bench")]
@@ -106,6 +108,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Routes(arguments) => routes::run(arguments, global),
         Command::Reload(arguments) => reload::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
+        Command::Top(arguments) => top::run(arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
         Command::Doctor(arguments) => doctor::run(arguments, global),
         #[cfg(feature = "bench")]

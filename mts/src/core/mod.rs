@@ -254,8 +254,7 @@ impl Core {
         self.fail_waiting(is_own, FailureReason::Closed);
         if let Some(mut inbox) = self.agents.remove(&incarnation) {
             let receiver = Arc::clone(&inbox.name);
-            self.table.counts()
-                .event(Event::Read, inbox.len() as u64);
+            self.table.counts().event(Event::Read, inbox.len() as u64);
             for (stream, back) in inbox.all_waiting() {
                 self.table.credit(stream, Arc::clone(&receiver), back);
             }

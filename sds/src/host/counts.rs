@@ -42,7 +42,12 @@ impl Guard<'_> {
         let written = file.write_all(&values.to_page());
         // Another member of a group may not shorten the file: its process would get a signal as it counts.
         let written = written
-            .and_then(|()| Ok(rustix::fs::fchmod(&file, Mode::RUSR | Mode::WUSR | group_reads)?))
+            .and_then(|()| {
+                Ok(rustix::fs::fchmod(
+                    &file,
+                    Mode::RUSR | Mode::WUSR | group_reads,
+                )?)
+            })
             .map_err(self.host_dir.io("write", temporary));
         let renamed = written.and_then(|()| self.host_dir.rename(temporary, name));
         if let Err(error) = renamed {

@@ -45,7 +45,7 @@ pub(in crate::command) enum CheckResult {
 }
 
 impl CheckResult {
-    pub(super) fn is_violation(&self) -> bool {
+    pub(in crate::command) fn is_violation(&self) -> bool {
         matches!(self, Self::Violation(_))
     }
 

@@ -9,7 +9,7 @@ mod mermaid;
 mod recorder;
 mod sequence;
 mod tally;
-mod text;
+pub(super) mod text;
 
 use std::path::{Path, PathBuf};
 use std::pin::pin;
