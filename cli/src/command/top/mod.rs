@@ -308,11 +308,9 @@ impl Target {
         let shown = view.filter.as_ref().map(|filter| &filter.matcher);
         let text = match self {
             Self::Screen(screen, palette) => {
-                let drawn = screen
-                    .terminal
-                    .draw(|frame| screen::draw(frame, snapshot, view, *palette));
+                let drawn = screen.draw(|frame| screen::draw(frame, snapshot, view, *palette));
                 return drawn
-                    .map(|_| true)
+                    .map(|()| true)
                     .map_err(|error| terminal_failure(&error));
             }
             Self::Text => output::printable(&print::text(snapshot, view.order, shown)).into_owned(),

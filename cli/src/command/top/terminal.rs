@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event};
+use ratatui::{DefaultTerminal, Frame};
 use tokio::sync::mpsc;
 
 use crate::log_output::HeldLog;
@@ -18,7 +18,8 @@ const MAX_KEYS: usize = 64;
 
 /// The alternate screen of the terminal, in raw mode. Dropping it restores the terminal; so does a panic.
 pub(super) struct Screen {
-    pub(super) terminal: DefaultTerminal,
+    /// Always there until the screen is dropped.
+    terminal: Option<DefaultTerminal>,
     closed: Arc<AtomicBool>,
     // Dropped after the terminal is restored.
     _held: HeldLog,
@@ -31,7 +32,7 @@ impl Screen {
         let terminal = ratatui::try_init().inspect_err(|_| drop(ratatui::try_restore()))?;
         let closed = Arc::new(AtomicBool::new(false));
         let screen = Self {
-            terminal,
+            terminal: Some(terminal),
             closed: Arc::clone(&closed),
             _held: held,
         };
@@ -41,6 +42,14 @@ impl Screen {
             .spawn(move || read(&sender, &closed))?;
         Ok((screen, keys))
     }
+
+    /// Draws the whole screen.
+    pub(super) fn draw(&mut self, draw: impl FnOnce(&mut Frame<'_>)) -> io::Result<()> {
+        match &mut self.terminal {
+            Some(terminal) => terminal.draw(draw).map(drop),
+            None => Ok(()),
+        }
+    }
 }
 
 impl Drop for Screen {
@@ -48,6 +57,12 @@ impl Drop for Screen {
         self.closed.store(true, Ordering::Relaxed);
         // A closed terminal cannot be restored.
         drop(ratatui::try_restore());
+        if let Some(mut terminal) = self.terminal.take()
+            && terminal.show_cursor().is_err()
+        {
+            // It would print the error when it is dropped, which panics if standard error is this terminal.
+            std::mem::forget(terminal);
+        }
     }
 }
 

@@ -155,7 +155,7 @@ impl Meter {
         }
         if let Some(time) = passage.delivery_time() {
             self.all.time(now, time);
-            if let Some(sender) = passage.sender() {
+            if let Some(sender) = agent_of(passage) {
                 self.agent(now, sender).time(now, time);
             }
             if let Some(host) = observed.host.and_then(|host| self.host(now, host)) {
@@ -168,7 +168,7 @@ impl Meter {
     fn add_for_sender(&mut self, now: Instant, observed: &Observed<'_>, counts: Counts) {
         let slots = self.slots;
         self.all.add(now, slots, counts);
-        if let Some(sender) = observed.passage.sender() {
+        if let Some(sender) = agent_of(observed.passage) {
             self.agent(now, sender).add(now, slots, counts);
         }
         if let Some(host) = observed.host.and_then(|host| self.host(now, host)) {
@@ -183,7 +183,7 @@ impl Meter {
 
     fn carry(&mut self, now: Instant, observed: &Observed<'_>, via: fipa::Kind) {
         let (passage, slots) = (observed.passage, self.slots);
-        if let Some(sender) = passage.sender() {
+        if let Some(sender) = agent_of(passage) {
             self.agent(now, sender).carry(now, slots, via);
         }
         self.agent(now, &passage.receiver).carry(now, slots, via);
@@ -252,6 +252,11 @@ impl Meter {
     pub(super) fn lost(&self) -> u64 {
         self.lost
     }
+}
+
+/// The agent that sends the letter; `None` if a message transport service does, to report a failure.
+fn agent_of(passage: &Passage) -> Option<&str> {
+    passage.sender().filter(|_| !passage.from_service)
 }
 
 /// Whether the receiver, or a peer that cannot confirm, has the letter.

@@ -124,6 +124,20 @@ fn news_of_a_letter_count_once() {
 }
 
 #[test]
+fn a_service_that_reports_a_failure_is_no_agent() {
+    let now = Instant::now();
+    let mut meter = Meter::new(now, WINDOW);
+    let report = Passage {
+        from_service: true,
+        submission: None,
+        ..named(1, "sherpa-4711", "rover", Fate::Taken)
+    };
+    meter.letter(now, &observed(&report), false);
+    let names: Vec<&str> = meter.agents().map(|(name, _)| name).collect();
+    assert_eq!(names, ["rover"]);
+}
+
+#[test]
 fn letters_of_another_host_count_for_it() {
     let now = Instant::now();
     let mut meter = Meter::new(now, WINDOW);

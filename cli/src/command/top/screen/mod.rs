@@ -5,6 +5,7 @@ use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::text::{Line, Span};
+use unicode_width::UnicodeWidthStr;
 
 use super::peers::{PeerRow, PeerState};
 use super::table::{self, AgentRow, Column, Header, PEER_TITLES, Snapshot};
@@ -28,6 +29,9 @@ const PEER_COLUMNS: [(Option<usize>, usize); 9] = [
 
 /// The cells of hosts that are aligned to the left.
 const PEER_TEXTS: [usize; 4] = [0, 1, 6, 7];
+
+/// Number of lines from which blank ones separate the tables.
+const ROOMY: usize = 12;
 
 const HELP: [&str; 18] = [
     "q Ctrl-C   quit",
@@ -121,20 +125,26 @@ pub(super) fn draw(frame: &mut Frame<'_>, snapshot: &Snapshot, view: &View, pale
     };
     if view.help {
         let width = lines.width();
-        HELP.map(|line| lines.put(cut(line, width)));
+        for line in HELP {
+            lines.put(cut(line, width));
+        }
         return;
     }
     header(&mut lines, &snapshot.header, view, palette);
-    // The footer has the last line; the hosts have at most a third of the rest.
+    // The footer has the last line; the hosts have at most a third of the rest, or two lines.
     let room = lines.left().saturating_sub(1);
+    let blank = usize::from(room >= ROOMY);
     let for_peers = match snapshot.peers.len() {
         0 => 0,
-        peers => (peers + 2).min(room / 3),
+        _ if room < 5 => 0,
+        peers => (peers + 1 + blank).min((room / 3).max(2)),
     };
     agents(&mut lines, snapshot, view, palette, room - for_peers);
-    if for_peers > 1 {
-        lines.put("");
-        peers(&mut lines, &snapshot.peers, palette, for_peers - 1);
+    if for_peers > 0 {
+        if blank > 0 {
+            lines.put("");
+        }
+        peers(&mut lines, &snapshot.peers, palette, for_peers - blank);
     }
     while lines.left() > 1 {
         lines.put("");
@@ -163,39 +173,66 @@ fn header(lines: &mut Lines<'_>, header: &Header, view: &View, palette: Palette)
         Some(name) => format!("gateway {}", fipa_acl::escape_name(name)),
         None => "no gateway".to_owned(),
     };
-    let text = format!(
-        "agents {} here, {} elsewhere   processes {}   {gateway}",
-        there.here, there.elsewhere, there.processes
-    );
-    lines.put(cut(&text, width));
+    let agents = format!("agents {} here, {} elsewhere", there.here, there.elsewhere);
+    let processes = format!("processes {}", there.processes);
+    let plain = |text: String| (text, Style::new());
+    flow(lines, [agents, processes, gateway].map(plain));
     let rates = &header.rates;
-    let mark = |value: f64, style: Style| if value > 0.0 { style } else { Style::new() };
+    let counted = |text: String, value: f64, style: Style| match value > 0.0 {
+        true => (text, style),
+        false => (text, Style::new()),
+    };
+    let violations = header.total.violations;
     let median = table::time(header.latency.map(|it| it.median));
     let percentile_99 = table::time(header.latency.map(|it| it.percentile_99));
-    let mut spans = vec![
-        Span::raw(format!("letters {}/s   ", table::rate(rates.sent))),
-        Span::styled(
+    let numbers = [
+        plain(format!("letters {}/s", table::rate(rates.sent))),
+        counted(
             format!("failures {}/s", table::rate(rates.failed)),
-            mark(rates.failed, palette.warning()),
+            rates.failed,
+            palette.warning(),
         ),
-        Span::raw("   "),
-        Span::styled(
-            format!("violations {}", table::count(header.total.violations)),
-            mark(header.total.violations as f64, palette.bad()),
+        counted(
+            format!("violations {}", table::count(violations)),
+            violations as f64,
+            palette.bad(),
         ),
-        Span::raw(format!("   median {median}   p99 {percentile_99}")),
+        counted(
+            format!("lost {}", table::count(header.lost)),
+            header.lost as f64,
+            palette.warning(),
+        ),
+        plain(format!("median {median}")),
+        plain(format!("p99 {percentile_99}")),
     ];
-    if header.lost > 0 {
-        let lost = format!("   lost records {}", table::count(header.lost));
-        spans.push(Span::styled(lost, palette.warning()));
-    }
-    lines.put(spans);
+    flow(lines, numbers);
     if let Some(problem) = &there.problem {
         lines.put(Span::styled(cut(problem, width), palette.warning()));
     }
-    if lines.left() > 12 {
+    if lines.left() > ROOMY {
         lines.put("");
     }
+}
+
+/// Puts texts side by side, on as many lines as they need.
+fn flow<const N: usize>(lines: &mut Lines<'_>, texts: [(String, Style); N]) {
+    const GAP: &str = "  ";
+    let width = lines.width();
+    let (mut spans, mut used) = (Vec::new(), 0);
+    for (text, style) in texts {
+        let text = cut(&text, width);
+        if !spans.is_empty() && used + GAP.len() + text.width() > width {
+            lines.put(std::mem::take(&mut spans));
+            used = 0;
+        }
+        if !spans.is_empty() {
+            spans.push(Span::raw(GAP));
+            used += GAP.len();
+        }
+        used += text.width();
+        spans.push(Span::styled(text, style));
+    }
+    lines.put(spans);
 }
 
 /// Draws the agents in at most this number of lines.
@@ -349,7 +386,7 @@ fn line<const N: usize>(
 /// The text in exactly this number of columns, at their right end.
 fn right(text: &str, width: usize) -> String {
     let text = cut(text, width);
-    let blank = width.saturating_sub(unicode_width::UnicodeWidthStr::width(&*text));
+    let blank = width.saturating_sub(text.width());
     " ".repeat(blank) + &text
 }
 
