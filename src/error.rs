@@ -32,6 +32,8 @@ use crate::config::{ConfigError, RuleError};
 pub use crate::domain::coalition::CoalitionError;
 use crate::domain::files::DomainDir;
 pub use crate::domain::files::DomainDirError;
+#[cfg(feature = "web")]
+pub use crate::web::{TokenError, WebError};
 
 /// The error of [`Domain::open`](crate::Domain::open) and of opening a gateway or a watcher.
 #[derive(Debug, thiserror::Error)]
@@ -67,6 +69,10 @@ pub enum OpenError {
         /// The error of the transport.
         source: ListenError,
     },
+    /// The HTTP listener of the gateway cannot be opened.
+    #[cfg(feature = "web")]
+    #[error(transparent)]
+    Web(#[from] WebError),
     /// None of the configured transports can be used. Holds the reason for each.
     #[error("no transport can be used: {0}")]
     NoTransport(String),

@@ -129,6 +129,8 @@ pub mod protocol;
 pub mod topics;
 #[cfg(any(feature = "protocols", feature = "secure"))]
 mod wall_clock;
+#[cfg(feature = "web")]
+mod web;
 
 pub use agent::delivery::{Deliveries, Delivery};
 pub use agent::incoming::Incoming;

@@ -55,7 +55,9 @@ pub use exchange::{
     Present,
 };
 pub use fipa_acl::{Pattern, PatternError, is_pattern};
-pub use host::{Cancellation, Departures, HostConfig, HostDirectory, HostError, SocketId};
+pub use host::{
+    Cancellation, Departures, HostConfig, HostCounts, HostDirectory, HostError, SocketId,
+};
 #[cfg(feature = "mdns")]
 pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, probe};
 pub use memory::{MemoryDirectory, StaticDirectory};

@@ -14,8 +14,8 @@ use fipa_transport::{Kind, Location};
 use super::keys::dotted;
 use super::keys::{is_interface_name, is_numeric_address};
 use super::{
-    Access, Config, Interface, Mistake, Origin, PeerConfig, Platform, PlatformAgent, RouteConfig,
-    Shm,
+    Access, Config, Http, Interface, Mistake, Origin, PeerConfig, Platform, PlatformAgent,
+    RouteConfig, Shm,
 };
 
 /// Maximum length of the name of a domain, in bytes.

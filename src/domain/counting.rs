@@ -3,6 +3,8 @@
 use std::sync::Arc;
 
 use fipa_acl::ErrorChain;
+#[cfg(feature = "web")]
+use fipa_sds::HostCounts;
 use fipa_sds::{HostDirectory, HostError};
 use fipa_transport::counts::{Counts, SharedCounts, Totals};
 use fipa_transport::log_limit;
@@ -75,13 +77,14 @@ impl Counting {
         }
     }
 
-    /// The sum of the counters of all processes of the domain on this host that show them, and of this one.
-    pub(crate) fn totals(&self, host: &HostDirectory) -> Result<Totals, HostError> {
-        let mut sum = host.sum_counts()?;
+    /// The counters of the processes of the domain on this host that show them, and of this one.
+    #[cfg(feature = "web")]
+    pub(crate) fn totals(&self, host: &HostDirectory) -> Result<HostCounts, HostError> {
+        let mut sums = host.sum_counts()?;
         if let Self::Own(counts) = self {
-            sum.add(&counts.totals());
+            sums.running.add(&counts.totals());
         }
-        Ok(sum)
+        Ok(sums)
     }
 }
 
@@ -106,7 +109,7 @@ pub(crate) fn protocol_number(name: &str) -> usize {
 }
 
 /// The names of the protocols whose violations are counted, with their numbers.
-#[cfg(feature = "protocols")]
+#[cfg(all(feature = "protocols", feature = "web"))]
 pub(crate) fn protocols() -> impl Iterator<Item = (usize, &'static str)> {
     let named = PROTOCOLS.iter().map(String::as_str).enumerate();
     named.chain([(OTHER, "other")])

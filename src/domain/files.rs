@@ -55,9 +55,14 @@ const STALE: Duration = Duration::from_secs(12 * 60 * 60);
 /// File with the host identifier from before the directory was removed and created again.
 const HOST: &str = "host";
 
-/// Files that end with the last process of the domain: that with the host identifier, and the state of
-/// the gateway with its next version.
-const FILES: [&str; 3] = [HOST, DomainDir::STATE, DomainDir::NEXT_STATE];
+/// Files that end with the last process of the domain: that with the host identifier, the state of the gateway with its
+/// next version, and the token of its clients.
+const FILES: [&str; 4] = [
+    HOST,
+    DomainDir::STATE,
+    DomainDir::NEXT_STATE,
+    DomainDir::TOKEN,
+];
 
 /// Length of the file that is written to test a directory: about that of the files of one process.
 const PROBE: usize = 16 << 10;
@@ -142,6 +147,8 @@ impl DomainDir {
     pub(crate) const STATE: &str = "gateway.state";
     /// The file that replaces it.
     pub(crate) const NEXT_STATE: &str = "gateway.state.new";
+    /// File with the token of the clients of `http.listen`.
+    pub(crate) const TOKEN: &str = "http.token";
 
     /// Creates the directory of a domain, and checks that it is private.
     pub(crate) fn prepare(config: &Config) -> Result<Self, DomainDirError> {

@@ -13,6 +13,8 @@ mod gateway_agent;
 #[cfg(feature = "secure")]
 mod guard;
 mod introductions;
+#[cfg(feature = "web")]
+mod metrics;
 mod names;
 mod namesakes;
 mod neighbors;
@@ -23,6 +25,8 @@ mod state;
 
 use std::collections::BTreeMap;
 use std::fmt;
+#[cfg(feature = "web")]
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
@@ -64,9 +68,13 @@ use crate::admin::reload::ReloadRequests;
 use crate::config::{ConfigError, Reloaded};
 use crate::domain::background;
 use crate::domain::directory_view::DirectoryView;
+#[cfg(feature = "web")]
+use crate::domain::files::DomainDir;
 use crate::domain::process::Owner;
 use crate::domain::service::{Role, Service};
 use crate::error::OpenError;
+#[cfg(feature = "web")]
+use crate::error::WebError;
 use crate::{AgentId, Config};
 
 /// A running gateway. Ends when [`close`](Self::close) is called or the value is dropped.
@@ -83,6 +91,9 @@ pub struct Gateway {
     state: Arc<StateFile>,
     /// The letters of the gateway to itself that have arrived.
     arrivals: Arrivals,
+    /// The address of `http.listen`, with its port.
+    #[cfg(feature = "web")]
+    web_address: Option<std::net::SocketAddr>,
     tasks: Vec<JoinHandle<()>>,
 }
 
@@ -176,6 +187,8 @@ impl Gateway {
             exchange,
             state,
             arrivals: Arrivals::default(),
+            #[cfg(feature = "web")]
+            web_address: None,
             tasks: Vec::new(),
         };
         // The queue is created first, because letters arrive as soon as the name is registered.
@@ -215,6 +228,7 @@ impl Gateway {
             refused_dials,
             predecessor,
         )?;
+        gateway.serve_web(config)?;
         #[cfg(feature = "secure")]
         gateway.tasks.extend(guard.map(|guard| {
             let (service, exchange) = (Arc::clone(&gateway.service), Arc::clone(&gateway.exchange));
@@ -281,6 +295,41 @@ impl Gateway {
         self.neighbors.name_peers(peers.clone());
         self.service.mts.keep_in_touch(peers);
         Ok(())
+    }
+
+    /// Answers requests at `http.listen`.
+    #[cfg(feature = "web")]
+    fn serve_web(&mut self, config: &Config) -> Result<(), OpenError> {
+        use crate::web::{Listener, Token};
+        let http = &config.http;
+        if http.listen.is_empty() {
+            return Ok(());
+        }
+        let token = Token::load(&self.web_token_file()).map_err(WebError::Token)?;
+        let listener = Listener::open(&http.listen, &http.names, token)?;
+        self.web_address = Some(listener.address());
+        let shown = metrics::Shown {
+            service: Arc::clone(&self.service),
+            view: Arc::clone(&self.view),
+            neighbors: Arc::clone(&self.neighbors),
+            check: self.self_check(),
+            discovery_problem: self.discovery_problem(),
+            shown: Mutex::default(),
+        };
+        let serving = listener.serve(Arc::new(shown));
+        self.tasks.push(tokio::spawn(serving));
+        Ok(())
+    }
+
+    #[cfg(not(feature = "web"))]
+    fn serve_web(&mut self, config: &Config) -> Result<(), OpenError> {
+        match config.http.listen.is_empty() {
+            true => Ok(()),
+            false => Err(OpenError::NoFeature {
+                key: "http.listen",
+                feature: "web",
+            }),
+        }
     }
 
     fn means(&self) -> Result<Means, OpenError> {
@@ -396,6 +445,23 @@ impl Gateway {
             service: Arc::clone(&self.service),
             view: Arc::clone(&self.view),
             arrivals: self.arrivals.clone(),
+        }
+    }
+
+    /// Returns the address at which the gateway answers Prometheus and health checks, if `http.listen` is set.
+    #[cfg(feature = "web")]
+    #[must_use]
+    pub fn web_address(&self) -> Option<std::net::SocketAddr> {
+        self.web_address
+    }
+
+    /// Returns the file with the token that clients of that address send.
+    #[cfg(feature = "web")]
+    #[must_use]
+    pub fn web_token_file(&self) -> PathBuf {
+        match self.config.http.token_file.is_empty() {
+            true => self.service.dir.part(DomainDir::TOKEN),
+            false => PathBuf::from(&self.config.http.token_file),
         }
     }
 

@@ -40,6 +40,7 @@ Examples:
 
 JSON, one line when the gateway is ready:
   { \"name\": text, \"incarnation\": text, \"domain\": text, \"locations\": [ text ],
+    \"http\": { \"address\": text, \"token_file\": text } or null without http.listen,
     \"discovery\": { \"mdns\": true or false, \"problem\": text, if there is one },
     \"security\": { \"encrypted\": true or false, \"insecure\": security.insecure,
                   \"trusted\": [ { \"mts\": text, \"fingerprint\": text } ] } }")]
@@ -127,6 +128,13 @@ fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
     for location in gateway.locations() {
         text.push_str(&format!("  listening on {location}\n"));
     }
+    if let Some(address) = gateway.web_address() {
+        let token = gateway.web_token_file();
+        let token = escape(&token.to_string_lossy()).into_owned();
+        text.push_str(&format!(
+            "  metrics at http://{address}/metrics, with the token in {token}\n"
+        ));
+    }
     text.push_str(&format!("  other hosts: {}\n", trusted_hosts(config)));
     let discovery = match (config.discovery.mdns, problem) {
         (false, _) => "off (discovery.mdns = false)".to_owned(),
@@ -183,6 +191,10 @@ fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Valu
         "incarnation": gateway.incarnation(),
         "domain": config.domain,
         "locations": locations.collect::<Vec<_>>(),
+        "http": gateway.web_address().map(|address| json!({
+            "address": address.to_string(),
+            "token_file": gateway.web_token_file().to_string_lossy(),
+        })),
         "discovery": discovery,
         "security": {
             "encrypted": !config.security.keys.is_empty(),

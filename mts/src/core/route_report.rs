@@ -81,6 +81,9 @@ pub struct RouteState {
     pub turned_back: u64,
     /// Number of failed attempts: no connection, or no answer.
     pub failed: u64,
+    /// Smoothed time from an attempt to its answer, in microseconds. `None` before the first, and for this host.
+    #[serde(default)]
+    pub answer_micros: Option<u64>,
     /// Error of the last of these.
     pub last_error: Option<String>,
     /// Seconds since that error.
@@ -154,6 +157,7 @@ impl LaneTable {
                     taken: read(&tally.taken),
                     turned_back: read(&tally.turned_back),
                     failed: read(&tally.failed),
+                    answer_micros: Some(read(&tally.answer_micros)).filter(|it| *it > 0),
                     last_error_seconds: last_error.as_ref().map(|(_, at)| ago(*at).as_secs()),
                     last_error: last_error.map(|(text, _)| text),
                 }
@@ -169,6 +173,12 @@ impl Core {
     #[must_use]
     pub fn route(&self, now: Now, entry: &Entry) -> Route {
         self.table.route(now.instant, entry)
+    }
+
+    /// Returns the bytes of the letters that have no outcome yet: at a gateway, those in custody.
+    #[must_use]
+    pub fn held_bytes(&self) -> usize {
+        self.table.custody.held()
     }
 
     /// Returns the counters of each location, sorted by location.

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_transport::Location;
 use parking_lot::Mutex;
@@ -17,6 +17,8 @@ pub(crate) struct Tally {
     pub(super) taken: AtomicU64,
     pub(super) turned_back: AtomicU64,
     pub(super) failed: AtomicU64,
+    /// Smoothed time until an answer, in microseconds; 0 before the first. Only of locations on other hosts.
+    pub(super) answer_micros: AtomicU64,
     pub(super) last_error: Mutex<Option<(String, Instant)>>,
 }
 
@@ -32,6 +34,17 @@ impl Tally {
     pub(super) fn add(counter: &AtomicU64) {
         let before = counter.load(Ordering::Relaxed);
         counter.store(before.wrapping_add(1), Ordering::Relaxed);
+    }
+
+    /// Records the time from an attempt to its answer.
+    pub(super) fn answered_after(&self, took: Duration) {
+        let took = u64::try_from(took.as_micros()).unwrap_or(u64::MAX).max(1);
+        let smoothed = match self.answer_micros.load(Ordering::Relaxed) {
+            0 => took,
+            // As TCP does (RFC 6298 section 2).
+            known => known - known / 8 + took / 8,
+        };
+        self.answer_micros.store(smoothed.max(1), Ordering::Relaxed);
     }
 
     pub(super) fn fail(&self, now: Instant, error: &impl std::fmt::Display) {

@@ -548,6 +548,12 @@ impl Mts {
         parts.collect()
     }
 
+    /// Returns the bytes of the letters that have no outcome yet: at a gateway, those in custody.
+    #[must_use]
+    pub fn held_bytes(&self) -> usize {
+        self.shared.lock().core.held_bytes()
+    }
+
     /// Returns the health and counters of each route; see [`Core::ways`].
     #[must_use]
     pub fn ways(&self) -> Vec<RouteState> {

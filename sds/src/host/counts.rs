@@ -10,6 +10,15 @@ use rustix::fs::Mode;
 use super::HostError;
 use super::host_dir::{Guard, HostDir, Id, Name};
 
+/// The counters of the processes of a domain on this host.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct HostCounts {
+    /// The sum of those of running processes.
+    pub running: Totals,
+    /// The sum of those of processes that have ended.
+    pub ended: Totals,
+}
+
 impl Guard<'_> {
     /// Creates the page of this process, with these values. Replaces an earlier one.
     pub(super) fn create_counts(&self, values: &Totals) -> Result<File, HostError> {
@@ -60,19 +69,22 @@ impl Guard<'_> {
 }
 
 impl HostDir {
-    /// Reads the pages of all processes. Sums them with those of processes that have ended.
-    pub(super) fn sum_counts(&self) -> Result<Totals, HostError> {
+    /// Reads the pages of all processes.
+    pub(super) fn sum_counts(&self) -> Result<HostCounts, HostError> {
         // Under the lock, no page moves to the sum of those that have ended.
         let _guard = self.lock()?;
-        let mut sum = Totals::default();
+        let mut sums = HostCounts::default();
         for name in self.names()? {
-            if matches!(name, Name::Counts(_) | Name::Ended)
-                && let Some(values) = self.read_counts(name)?
-            {
+            let sum = match name {
+                Name::Counts(_) => &mut sums.running,
+                Name::Ended => &mut sums.ended,
+                _ => continue,
+            };
+            if let Some(values) = self.read_counts(name)? {
                 sum.add(&values);
             }
         }
-        Ok(sum)
+        Ok(sums)
     }
 
     /// `None` if there is no such page, or a process of another version wrote it.

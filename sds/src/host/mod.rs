@@ -39,6 +39,7 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 
 pub use self::cancellation::Cancellation;
+pub use self::counts::HostCounts;
 use self::host_dir::{HostDir, Id, Name};
 use self::remote::RemoteAgents;
 use self::shared::Shared;
@@ -244,12 +245,12 @@ impl HostDirectory {
         self.shared.host_dir().lock()?.create_counts(values)
     }
 
-    /// Returns the sum of the counters of all processes of the domain on this host, running or not. Takes system calls,
-    /// but wakes no process.
+    /// Returns the sums of the counters of the processes of the domain on this host. Takes system calls, but wakes no
+    /// process.
     ///
     /// # Errors
     /// Fails when the files cannot be read.
-    pub fn sum_counts(&self) -> Result<Totals, HostError> {
+    pub fn sum_counts(&self) -> Result<HostCounts, HostError> {
         self.shared.host_dir().sum_counts()
     }
 

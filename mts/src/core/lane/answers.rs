@@ -40,7 +40,11 @@ impl Lane {
         if !is_current {
             return;
         }
-        let State::UnderWay { location, .. } = std::mem::replace(state, State::Ended) else {
+        let before = std::mem::replace(state, State::Ended);
+        let State::UnderWay {
+            location, since, ..
+        } = before
+        else {
             return;
         };
         self.end_transit();
@@ -59,6 +63,9 @@ impl Lane {
                         }
                         _ => &tally.turned_back,
                     });
+                    if !location.kind().is_host_local() {
+                        tally.answered_after(now.saturating_duration_since(since));
+                    }
                 }
                 table.routes.worked(&location);
                 self.route_worked(&location);

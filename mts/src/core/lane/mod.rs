@@ -512,6 +512,7 @@ impl Lane {
         open_letter.progress.state = State::UnderWay {
             attempt,
             location: route.clone(),
+            since: now,
             times_out,
             abandoned: false,
         };

@@ -100,6 +100,7 @@ pub(super) enum State {
     UnderWay {
         attempt: AttemptId,
         location: Location,
+        since: Instant,
         times_out: Instant,
         /// Whether the transport was asked to end the attempt, whose conclusion follows at once.
         abandoned: bool,

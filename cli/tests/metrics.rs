@@ -1,0 +1,276 @@
+//! The metrics of a gateway, with real processes.
+
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::{Read as _, Write as _};
+use std::net::{SocketAddr, TcpStream};
+use std::time::Duration;
+
+use common::{Host, Running};
+use serde_json::Value;
+
+/// Timeout for hanging tests.
+const WATCHDOG: Duration = Duration::from_secs(60);
+
+/// Maximum number of series of a host without neighbors.
+const MAX_SERIES: usize = 200;
+
+/// A gateway that shows metrics.
+struct Shown {
+    _gateway: Running,
+    address: SocketAddr,
+    token: String,
+}
+
+impl Shown {
+    fn start(host: &Host, listen: &str) -> Self {
+        let listen = format!("http.listen={listen}");
+        let names = "http.names=[\"rover.example\"]";
+        let arguments = ["up", "--json", "--set", &listen, "--set", names];
+        let gateway = host.start(&arguments);
+        let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
+        let file = ready["http"]["token_file"].as_str().unwrap();
+        Self {
+            _gateway: gateway,
+            address: ready["http"]["address"].as_str().unwrap().parse().unwrap(),
+            token: fs::read_to_string(file).unwrap().trim_end().to_owned(),
+        }
+    }
+
+    /// The status and the body of the answer to a request with these lines after the first.
+    fn ask(&self, path: &str, headers: &str) -> (u16, String) {
+        let mut stream = self.connect();
+        write!(stream, "GET {path} HTTP/1.1\r\n{headers}\r\n").unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).unwrap();
+        let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+        (status, body.to_owned())
+    }
+
+    fn connect(&self) -> TcpStream {
+        let stream = TcpStream::connect(self.address).unwrap();
+        stream.set_read_timeout(Some(WATCHDOG)).unwrap();
+        stream
+    }
+
+    fn admitted(&self) -> String {
+        format!(
+            "Host: {}\r\nAuthorization: Bearer {}\r\n",
+            self.address, self.token
+        )
+    }
+
+    /// The values by their series.
+    fn values(&self) -> BTreeMap<String, f64> {
+        let (status, text) = self.ask("/metrics", &self.admitted());
+        assert_eq!(status, 200, "{text}");
+        let lines = text.lines().filter(|line| !line.starts_with('#'));
+        let values = lines.map(|line| {
+            let (series, value) = line.rsplit_once(' ').unwrap();
+            (series.to_owned(), value.parse().unwrap())
+        });
+        values.collect()
+    }
+}
+
+fn letters(direction: &str, transport: &str, outcome: &str) -> String {
+    format!(
+        "fipa_letters_total{{direction=\"{direction}\",transport=\"{transport}\",outcome=\"{outcome}\"}}"
+    )
+}
+
+#[test]
+fn letters_of_all_processes_are_counted_and_stay_counted_when_these_end() {
+    let host = Host::new();
+    let shown = Shown::start(&host, "127.0.0.1:0");
+    let echo = host.echo("echo");
+    let before = shown.values();
+    assert_eq!(before.get(&letters("sent", "shm", "delivered")), None);
+
+    let ping = ["ping", "echo", "--count", "20", "--interval", "1ms"];
+    host.run(&ping).done();
+    let (failed, _) = host.run(&["send", "nobody_here", "text"]).failed_text();
+    assert!(!failed.is_empty());
+    let counted = shown.values();
+    let delivered = counted[&letters("sent", "shm", "delivered")];
+    assert!(delivered >= 20.0, "{counted:#?}");
+    assert_eq!(counted[&letters("received", "shm", "delivered")], delivered);
+    assert_eq!(counted[&letters("sent", "none", "failed")], 1.0);
+    assert_eq!(
+        counted["fipa_delivery_seconds_count{transport=\"shm\"}"],
+        delivered
+    );
+    assert_eq!(counted["fipa_letters_under_way"], 0.0);
+    assert_eq!(counted["fipa_letters_queued"], 0.0);
+
+    // A killed process counted, too, and another one now keeps its counters.
+    let (code, _) = echo.signal("-KILL");
+    assert_eq!(code, None);
+    host.run(&["agents"]).done();
+    let _again = host.echo("echo");
+    host.run(&ping).done();
+    let kept = shown.values();
+    assert!(kept[&letters("sent", "shm", "delivered")] >= delivered + 20.0);
+    assert!(kept.len() <= MAX_SERIES, "{} series", kept.len());
+    let falls = |(series, value): (&String, &f64)| {
+        let is_counter = ["_total", "_bucket", "_count", "_sum"]
+            .iter()
+            .any(|end| series.split('{').next().unwrap().ends_with(end));
+        is_counter && kept.get(series).is_none_or(|later| later < value)
+    };
+    let fallen: Vec<_> = counted.iter().filter(|it| falls(*it)).collect();
+    assert!(fallen.is_empty(), "{fallen:?}");
+}
+
+#[test]
+fn counters_survive_the_removal_of_their_files() {
+    let host = Host::new();
+    let shown = Shown::start(&host, "127.0.0.1:0");
+    let mut echo = host.echo("echo");
+    let ping = ["ping", "echo", "--count", "10", "--interval", "1ms"];
+    host.run(&ping).done();
+    let received = letters("received", "shm", "delivered");
+    let before = shown.values()[&received];
+    let directory = host.path("run").join(&host.domain).join("directory");
+    let files = fs::read_dir(&directory)
+        .unwrap()
+        .map(|file| file.unwrap().path());
+    let counts = files.filter(|file| file.to_string_lossy().ends_with(".counts"));
+    for file in counts.collect::<Vec<_>>() {
+        fs::remove_file(file).unwrap();
+    }
+    echo.wait_for_log(&["joined the domain", "again"]);
+    host.run(&ping).done();
+    let after = shown.values()[&received];
+    assert!(after >= before + 10.0, "{before} {after}");
+}
+
+#[test]
+fn violations_are_counted_by_protocol() {
+    let host = Host::new();
+    let shown = Shown::start(&host, "[::1]:0");
+    let mut echo = host.start(&["echo", "echo", "--set", "monitor.check=warn"]);
+    let text = [
+        "send",
+        "echo",
+        "text",
+        "-p",
+        "inform",
+        "--conversation-id",
+        "c1",
+    ];
+    let protocol = ["--protocol", "fipa-request"];
+    host.run(&[&text[..], &protocol].concat()).done();
+    echo.wait_for_log(&["violates its protocol"]);
+    let values = shown.values();
+    let violations = |protocol| format!("fipa_violations_total{{protocol=\"{protocol}\"}}");
+    assert_eq!(values[&violations("fipa-request")], 1.0, "{values:#?}");
+    assert_eq!(values[&violations("other")], 0.0);
+    let (status, _) = shown.ask("/readyz", &shown.admitted());
+    assert_eq!(status, 200);
+}
+
+/// The number of times that the threads of a process have waited.
+fn waits(pid: &str) -> u64 {
+    let tasks = fs::read_dir(format!("/proc/{pid}/task")).unwrap();
+    let of_task = |task: fs::DirEntry| -> u64 {
+        let status = fs::read_to_string(task.path().join("status")).unwrap();
+        let line = status
+            .lines()
+            .find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"));
+        line.unwrap().trim().parse().unwrap()
+    };
+    tasks.map(|task| of_task(task.unwrap())).sum()
+}
+
+#[test]
+fn a_question_for_metrics_wakes_no_other_process() {
+    const QUESTIONS: u64 = 200;
+    let host = Host::new();
+    let shown = Shown::start(&host, "127.0.0.1:0");
+    let echo = host.echo("echo");
+    host.run(&["ping", "echo", "--count", "1"]).done();
+    let before = waits(&echo.pid());
+    for _ in 0..QUESTIONS {
+        shown.values();
+    }
+    let waited = waits(&echo.pid()) - before;
+    // The process has work of its own from time to time.
+    assert!(
+        waited < QUESTIONS / 2,
+        "{waited} wake-ups of another process"
+    );
+}
+
+#[test]
+fn requests_without_the_token_or_under_another_name_are_refused() {
+    let host = Host::new();
+    let shown = Shown::start(&host, "127.0.0.1:0");
+    let own = format!("Host: {}\r\n", shown.address);
+    let token = format!("Authorization: Bearer {}\r\n", shown.token);
+    for path in ["/metrics", "/healthz", "/readyz"] {
+        assert_eq!(shown.ask(path, &format!("{own}{token}")).0, 200, "{path}");
+        for (headers, expected) in [
+            (own.clone(), 401),
+            (
+                format!("{own}Authorization: Bearer 0{}\r\n", shown.token),
+                401,
+            ),
+            (format!("{own}Authorization: Bearer \r\n"), 401),
+            (
+                format!("{own}Authorization: Basic {}\r\n", shown.token),
+                401,
+            ),
+            (format!("Host: evil.example\r\n{token}"), 421),
+            (format!("{own}Host: evil.example\r\n{token}"), 421),
+            (token.clone(), 421),
+            (format!("Host: ROVER.example:80\r\n{token}"), 200),
+        ] {
+            let (status, body) = shown.ask(path, &headers);
+            assert_eq!(status, expected, "{path} {headers} {body}");
+            assert!(!body.contains(&shown.token));
+        }
+    }
+    let (status, _) = shown.ask("/other", &shown.admitted());
+    assert_eq!(status, 404);
+    let long = format!("{own}{token}X: {}\r\n", "x".repeat(20_000));
+    let mut stream = shown.connect();
+    // The gateway may close the connection before it has read all.
+    let _ = write!(stream, "GET /metrics HTTP/1.1\r\n{long}\r\n");
+    let mut answer = Vec::new();
+    let _ = stream.read_to_end(&mut answer);
+    assert!(!answer.windows(5).any(|it| it == b"fipa_"));
+
+    // More connections than the gateway keeps, which send nothing: others get their turn.
+    let idle: Vec<TcpStream> = (0..64).map(|_| shown.connect()).collect();
+    assert_eq!(shown.ask("/healthz", &shown.admitted()).0, 200);
+    drop(idle);
+}
+
+#[test]
+fn a_wrong_configuration_is_explained() {
+    let host = Host::new();
+    for (setting, parts) in [
+        ("http.listen=0.0.0.0:0", ["http.listen", "127.0.0.1"]),
+        ("http.listen=9790", ["http.listen", "127.0.0.1"]),
+        ("http.token_file=~/token", ["http.token_file", "full path"]),
+    ] {
+        let error = host.run(&["up", "--set", setting]).failed(2);
+        for part in parts {
+            assert!(error.contains(part), "{error}");
+        }
+    }
+    let open = host.path("open.token");
+    fs::write(&open, "0123456789abcdef\n").unwrap();
+    let file = format!("http.token_file={}", open.display());
+    let listen = "http.listen=127.0.0.1:0";
+    let (_, error) = host
+        .run(&["up", "--set", listen, "--set", &file])
+        .failed_text();
+    assert!(error.contains("chmod 600"), "{error}");
+}
