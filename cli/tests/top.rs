@@ -170,6 +170,68 @@ fn tables_are_printed_without_a_terminal() {
 }
 
 #[test]
+fn hosts_are_connected_with_their_letters_and_then_lost() {
+    let (host, other) = (Host::new(), Host::new());
+    let far = format!("far-{}", other.domain);
+    let _far = other.echo(&far);
+    let crex = other.start(&["up", "--json", "--set", "mts.name=crex"]);
+    let peer = format!(
+        "discovery.static={{ crex = [\"tcp://{}\"] }}",
+        crex.tcp_address()
+    );
+    let _gateway = host.start(&["up", "--set", "mts.name=sherpa", "--set", &peer]);
+    let known = || host.run(&["agents", &far, "--json"]).done_json();
+    until("the far agent is announced", || {
+        !known()["agents"][0].is_null()
+    });
+    let mut top = host.start(&["top", "--json", "--every", "500ms"]);
+    let ask = [
+        "send",
+        "--from",
+        "rover",
+        "--to",
+        &far,
+        "--content",
+        "x",
+        "--count",
+        "30",
+        "--rate",
+        "20",
+        "--wait",
+    ];
+    let _asking = ChildGuard::start(
+        host.command(&ask)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null()),
+    );
+    let seen = find(&mut top, "letters to and from the host", |seen| {
+        let crex = &seen["hosts"][0];
+        crex["to_per_second"].as_f64() > Some(0.5) && crex["from_per_second"].as_f64() > Some(0.0)
+    });
+    let row = &seen["hosts"][0];
+    assert_eq!(
+        (&row["name"], &row["state"]),
+        (&"crex".into(), &"connected".into()),
+        "{seen:#}"
+    );
+    assert_eq!(
+        (&row["encrypted"], &row["transports"]),
+        (&false.into(), &serde_json::json!(["tcp"]))
+    );
+    assert!(row["median_us"].as_u64() > Some(0), "{seen:#}");
+    assert_eq!(agent(&seen, "rover")["via"], "tcp", "{seen:#}");
+    assert_eq!(
+        (&seen["gateway"], &seen["problem"]),
+        (&"sherpa".into(), &Value::Null)
+    );
+    crex.signal("-KILL");
+    let seen = find(&mut top, "the host is lost", |seen| {
+        seen["hosts"][0]["state"] == "lost"
+    });
+    assert_eq!(seen["hosts"][0]["encrypted"], Value::Null, "{seen:#}");
+}
+
+#[test]
 fn a_reader_that_ends_ends_the_command() {
     let host = Host::new();
     let mut command = host.command(&["top", "--json", "--every", "100ms"]);
