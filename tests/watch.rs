@@ -255,7 +255,7 @@ async fn a_watcher_that_does_not_read_delays_no_agent_and_gets_the_count_of_lost
             Ok(Event::Lost { process, records }) => {
                 *lost.entry(process.to_string()).or_insert(0) += records;
             }
-            Ok(Event::Later(_)) => {}
+            Ok(Event::Later(_) | Event::Confirmed(_)) => {}
             Ok(other) => panic!("{other:?}"),
             Err(_) => break,
         }

@@ -47,7 +47,7 @@ pub(crate) fn start(default_filter: &str, format: Option<LogFormat>) {
     };
     let builder = tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(std::io::stderr);
+        .with_writer(|| crate::log_output::LogOutput);
     match format.unwrap_or_else(format_of_environment) {
         LogFormat::Text => builder
             .with_ansi(std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none())

@@ -10,13 +10,14 @@
 //! * [`complete`] completes command lines for shells.
 //! * [`log`] writes the log.
 //! * [`report`] prints errors and warnings; [`output`] prints results; [`input`] reads files and
-//!   standard input.
+//!   standard input. [`log_output`] holds back texts for standard error while a command draws on the terminal.
 
 mod answers;
 mod command;
 mod complete;
 mod input;
 mod log;
+mod log_output;
 mod membership;
 mod options;
 mod output;

@@ -463,36 +463,52 @@ pub(crate) async fn gateway_report(
     domain: &Domain,
     receivers: Option<&str>,
 ) -> Result<Option<RouteReport>, Failure> {
-    let Some(gateway) = gateway(domain) else {
+    if gateway(domain).is_none() {
         return Ok(None);
-    };
+    }
+    let agent = asker(domain).await?;
+    report_to(&agent, receivers).await
+}
+
+/// Registers an agent that serves only to query the gateway of this host.
+pub(crate) async fn asker(domain: &Domain) -> Result<Agent, Failure> {
     let name = format!("fipa-routes-{}", Incarnation::random());
-    let failed = |error: &(dyn std::error::Error + 'static)| {
-        Failure::failed(
-            ErrorChain(error).to_string(),
-            format!("gateway {:?}", gateway.name),
-            "check the log of the gateway; if it hangs, restart it (`fipa up`)",
-        )
-    };
     let options = RegisterOptions {
         agent_type: routes::ASKER_TYPE.to_owned(),
         ..RegisterOptions::default()
     };
-    let agent = domain
-        .register_with(&name, options)
-        .await
-        .map_err(|error| failed(&error))?;
-    let report = routes::of_gateway(&agent, &gateway, receivers, REPORT_TIMEOUT).await;
+    let registered = domain.register_with(&name, options).await;
+    registered.map_err(|error| no_report(&error, "this host"))
+}
+
+/// Like [`gateway_report`], with the agent of [`asker`].
+pub(crate) async fn report_to(
+    agent: &Agent,
+    receivers: Option<&str>,
+) -> Result<Option<RouteReport>, Failure> {
+    let domain = agent.domain();
+    let Some(gateway) = gateway(domain) else {
+        return Ok(None);
+    };
+    let report = routes::of_gateway(agent, &gateway, receivers, REPORT_TIMEOUT).await;
     match report {
         Ok(mut report) => {
-            report.routes.retain(|route| route.receiver != name);
+            report.routes.retain(|route| route.receiver != agent.name());
             Ok(Some(report))
         }
         Err(AskError::NotDelivered(_)) if domain.directory().lookup(&gateway.name).is_none() => {
             Ok(None)
         }
-        Err(error) => Err(failed(&error)),
+        Err(error) => Err(no_report(&error, &format!("gateway {:?}", gateway.name))),
     }
+}
+
+fn no_report(error: &(dyn std::error::Error + 'static), place: &str) -> Failure {
+    Failure::failed(
+        ErrorChain(error).to_string(),
+        place,
+        "check the log of the gateway; if it hangs, restart it (`fipa up`)",
+    )
 }
 
 pub(crate) fn no_gateway() -> Failure {

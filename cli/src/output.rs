@@ -13,6 +13,7 @@ use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
 use serde::Serialize;
 use tokio::sync::oneshot;
+use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
 
 use crate::report::Failure;
 
@@ -119,6 +120,32 @@ fn rows_within(width: Option<usize>) -> Table {
             .set_width(width);
     }
     table
+}
+
+/// The text in exactly this number of columns: shortened, or padded with spaces.
+pub(crate) fn fitted(text: &str, width: usize) -> String {
+    let text = cut(text, width);
+    let blank = " ".repeat(width.saturating_sub(text.width()));
+    text + &blank
+}
+
+/// The text in at most this number of columns.
+pub(crate) fn cut(text: &str, width: usize) -> String {
+    if text.width() <= width {
+        return text.to_owned();
+    }
+    let mut columns_left = width.saturating_sub(1);
+    let fits = |c: &char| {
+        let needed = c.width().unwrap_or(0);
+        let fits = needed <= columns_left;
+        columns_left = columns_left.saturating_sub(needed);
+        fits
+    };
+    let mut short: String = text.chars().take_while(fits).collect();
+    if width > 0 {
+        short.push('…');
+    }
+    short
 }
 
 /// Prints the converted input of a command: unchanged for another program or a file, escaped on a
@@ -263,6 +290,14 @@ mod tests {
             );
             assert_eq!(serde_json::from_str::<Value>(&visible).unwrap(), value);
         }
+    }
+
+    #[test]
+    fn texts_are_cut_to_columns_not_to_characters() {
+        assert_eq!(fitted("arm", 5), "arm  ");
+        assert_eq!(fitted("manipulator", 5), "mani…");
+        assert_eq!(fitted("机器人手臂", 6), "机器… ");
+        assert_eq!(cut("x", 0), "");
     }
 
     #[test]

@@ -12,6 +12,7 @@ use fipa::error::ErrorChain;
 use fipa_acl::is_unprintable;
 use fipa_monitor::near_standard;
 
+use crate::log_output::LogOutput;
 use crate::output;
 
 /// The errors that ended a command, and its exit code.
@@ -210,5 +211,5 @@ fn indented(text: &str) -> String {
 
 /// Ignores a closed standard error: there is no other place to report it.
 fn to_stderr(text: &str) {
-    let _ = io::stderr().lock().write_all(text.as_bytes());
+    let _ = LogOutput.write_all(text.as_bytes());
 }

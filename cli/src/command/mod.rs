@@ -33,6 +33,7 @@ mod request;
 mod routes;
 mod send;
 mod subscribe;
+mod top;
 pub(crate) mod topics;
 mod up;
 mod watch;
@@ -69,6 +70,7 @@ pub(crate) enum Command {
     Watch(Box<watch::Arguments>),
     Record(Box<record::Arguments>),
     Replay(Box<replay::Arguments>),
+    Top(top::Arguments),
     Demo(demo::Arguments),
     Doctor(doctor::Arguments),
     #[cfg(feature = "bench")]
@@ -112,6 +114,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Record(arguments) => record::run(*arguments, global),
         Command::Replay(arguments) => replay::run(&arguments, global),
+        Command::Top(arguments) => top::run(arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
         Command::Doctor(arguments) => doctor::run(arguments, global),
         #[cfg(feature = "bench")]

@@ -45,6 +45,8 @@ impl Watching {
         let (passage, later) = match event {
             Event::Letter(passage) => (passage, false),
             Event::Later(passage) => (passage, true),
+            // The fate is compared at the end; `Taken` stands for the same outcome.
+            Event::Confirmed(_) => return Ok(()),
             other => return Err(format!("watched: {other:?}")),
         };
         let sender = passage.stream.sender;

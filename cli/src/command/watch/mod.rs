@@ -8,7 +8,7 @@ pub(super) mod json;
 mod mermaid;
 mod sequence;
 mod tally;
-mod text;
+pub(super) mod text;
 
 use std::path::{Path, PathBuf};
 use std::pin::pin;

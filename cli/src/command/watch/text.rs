@@ -7,10 +7,10 @@ use fipa::admin::watch::{Fate, Passage};
 use fipa::{Message, Outcome, Time};
 use fipa_acl::{escape, escape_name};
 use fipa_content::{Content, Printer, Profile};
-use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
+use unicode_width::UnicodeWidthStr;
 
 use super::checker::{CheckResult, Overdue};
-use crate::output;
+use crate::output::{self, cut, fitted};
 
 /// The properties of the terminal.
 #[derive(Debug, Clone, Copy, Default)]
@@ -310,33 +310,8 @@ fn agents(sender: &str, receiver: &str, width: usize) -> String {
     format!("{sender}{ARROW}{receiver}")
 }
 
-/// The text in exactly this number of columns: shortened, or padded with spaces.
-pub(super) fn fitted(text: &str, width: usize) -> String {
-    let text = cut(text, width);
-    let blank = " ".repeat(width.saturating_sub(text.width()));
-    text + &blank
-}
-
-/// The text in at most this number of columns.
-pub(super) fn cut(text: &str, width: usize) -> String {
-    if text.width() <= width {
-        return text.to_owned();
-    }
-    let mut columns_left = width.saturating_sub(1);
-    let fits = |c: &char| {
-        let needed = c.width().unwrap_or(0);
-        let fits = needed <= columns_left;
-        columns_left = columns_left.saturating_sub(needed);
-        fits
-    };
-    let mut short: String = text.chars().take_while(fits).collect();
-    if width > 0 {
-        short.push('…');
-    }
-    short
-}
-
-fn time_of_day(at: SystemTime, width: usize) -> String {
+/// The time of day in UTC, in at most this number of columns.
+pub(in crate::command) fn time_of_day(at: SystemTime, width: usize) -> String {
     let time = Time::from_system_time(at).ok().and_then(Time::to_rfc3339);
     let time = time
         .as_deref()
@@ -418,14 +393,6 @@ fn content(passage: &Passage) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn texts_are_cut_to_columns_not_to_characters() {
-        assert_eq!(fitted("arm", 5), "arm  ");
-        assert_eq!(fitted("manipulator", 5), "mani…");
-        assert_eq!(fitted("机器人手臂", 6), "机器… ");
-        assert_eq!(cut("x", 0), "");
-    }
 
     #[test]
     fn a_long_sender_does_not_hide_the_receiver() {

@@ -68,9 +68,19 @@ pub struct Passage {
     pub from_service: bool,
     /// State of the delivery.
     pub fate: Fate,
+    /// Time of the outcome that was reported to the sender, by the clock of this host.
+    pub settled_at: Option<SystemTime>,
 }
 
 impl Passage {
+    /// Time from sending to the outcome that was reported to the sender; `None` if one of them is not known.
+    #[must_use]
+    pub fn delivery_time(&self) -> Option<Duration> {
+        // Only the record of the sender has the time of sending.
+        let sent = self.submission.map(|_| self.at)?;
+        self.settled_at?.duration_since(sent).ok()
+    }
+
     /// Name of the sender in the message. If the message has none, its name in the envelope.
     #[must_use]
     pub fn sender(&self) -> Option<&str> {
@@ -107,6 +117,9 @@ pub enum Event {
     Letter(Arc<Passage>),
     /// The state of an already reported letter has changed.
     Later(Arc<Passage>),
+    /// The outcome of an already reported letter was reported to the sender. It equals the report of the receiver
+    /// that the letter had before, so only `settled_at` is new.
+    Confirmed(Arc<Passage>),
     /// A process could not send this many records.
     Lost {
         /// Name of its message transport service.
@@ -137,7 +150,7 @@ pub struct Joiner {
     waiting: BTreeMap<SendPosition, Key>,
     /// Letters that were reported, in order.
     reported: VecDeque<Key>,
-    outcomes_before_letters: HashMap<Key, (Outcome, bool)>,
+    outcomes_before_letters: HashMap<Key, (SystemTime, Outcome, bool)>,
     processes: HashMap<RecordSource, Process>,
     events: VecDeque<Event>,
     arrived: u64,
@@ -214,7 +227,7 @@ impl Joiner {
                 id,
                 outcome,
                 sender,
-            } => self.settled(id, outcome, sender),
+            } => self.settled(at, id, outcome, sender),
             RecordBody::Hello { .. } | RecordBody::Lost => {}
         }
     }
@@ -300,9 +313,10 @@ impl Joiner {
             from_elsewhere: false,
             from_service: false,
             fate: Fate::UnderWay,
+            settled_at: None,
         };
-        if let Some((outcome, sender)) = self.outcomes_before_letters.remove(&key) {
-            passage.settle(outcome, sender);
+        if let Some((at, outcome, sender)) = self.outcomes_before_letters.remove(&key) {
+            passage.settle(at, outcome, sender);
         }
         let known = KnownLetter {
             place,
@@ -315,18 +329,19 @@ impl Joiner {
         self.waiting.insert(place, key);
     }
 
-    fn settled(&mut self, id: LetterId, outcome: Outcome, sender: bool) {
+    fn settled(&mut self, at: SystemTime, id: LetterId, outcome: Outcome, sender: bool) {
         let key = (id.stream.sender, id.sequence);
         let Some(known) = self.letters.get_mut(&key) else {
             if self.outcomes_before_letters.len() >= MAX_EARLY {
                 // Of letters whose first record was lost or precedes the watch.
                 self.outcomes_before_letters.clear();
             }
-            self.outcomes_before_letters.insert(key, (outcome, sender));
+            self.outcomes_before_letters
+                .insert(key, (at, outcome, sender));
             return;
         };
         let (fate, seen_via) = (known.passage.fate.clone(), known.passage.via);
-        known.passage.settle(outcome, sender);
+        known.passage.settle(at, outcome, sender);
         let news = match (&fate, &known.passage.fate) {
             // The sender's outcome that equals the receiver's record is not a change.
             (Fate::Taken, Fate::Settled(Outcome::Delivered { via, attempts })) => {
@@ -334,9 +349,15 @@ impl Joiner {
             }
             (before, after) => before != after,
         };
-        if known.reported && news {
+        if !known.reported {
+            return;
+        }
+        if news {
             let later = Event::Later(Arc::new(known.passage.clone()));
             self.events.push_back(later);
+        } else if fate == Fate::Taken && known.passage.fate != fate {
+            let confirmed = Event::Confirmed(Arc::new(known.passage.clone()));
+            self.events.push_back(confirmed);
         }
     }
 
@@ -432,7 +453,7 @@ impl KnownLetter {
 }
 
 impl Passage {
-    fn settle(&mut self, outcome: Outcome, sender: bool) {
+    fn settle(&mut self, at: SystemTime, outcome: Outcome, sender: bool) {
         if matches!(self.fate, Fate::Settled(_)) {
             return;
         }
@@ -444,6 +465,7 @@ impl Passage {
                 self.via = Some(via);
             }
             self.fate = Fate::Settled(outcome);
+            self.settled_at = Some(at);
         } else if matches!(self.fate, Fate::UnderWay) || !outcome.is_success() {
             // The receiver's record takes precedence over an unknown outcome at a gateway.
             if self.fate != Fate::Taken {

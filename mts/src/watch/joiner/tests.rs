@@ -121,6 +121,42 @@ fn a_late_outcome_is_an_event_of_its_own() {
 }
 
 #[test]
+fn an_outcome_that_equals_the_report_of_the_receiver_adds_only_its_time() {
+    let (mut joiner, now) = (Joiner::new(), Instant::now());
+    joiner.handle(now, A, seen(1, id(7, 1), Seen::Sent(Some(4))));
+    joiner.handle(now, B, seen(2, id(7, 1), Seen::Taken(Some(Kind::Shm))));
+    let taken = only(all(&mut joiner, now + TIMEOUT));
+    assert_eq!((&taken.fate, taken.delivery_time()), (&Fate::Taken, None));
+    for _ in 0..2 {
+        let outcome = delivered(Kind::Shm);
+        joiner.handle(now, A, settled(901, id(7, 1), outcome, true));
+    }
+    let mut events = all(&mut joiner, now + TIMEOUT);
+    assert_eq!(events.len(), 1, "{events:?}");
+    let Event::Confirmed(confirmed) = events.remove(0) else {
+        panic!("the sender has the same outcome");
+    };
+    assert_eq!(confirmed.fate, Fate::Settled(delivered(Kind::Shm)));
+    let time = Duration::from_millis(900);
+    assert_eq!(confirmed.delivery_time(), Some(time));
+}
+
+#[test]
+fn the_delivery_time_needs_the_records_of_sending_and_of_the_outcome() {
+    for sent in [None, Some(4)] {
+        let (mut joiner, now) = (Joiner::new(), Instant::now());
+        let outcome = || settled(31, id(7, 1), delivered(Kind::Shm), true);
+        // The outcome arrives before the letter.
+        joiner.handle(now, A, outcome());
+        let place = sent.map_or(Seen::Taken(Some(Kind::Shm)), |it| Seen::Sent(Some(it)));
+        joiner.handle(now, A, seen(1, id(7, 1), place));
+        let passage = only(all(&mut joiner, now + HOLD));
+        let expected = sent.map(|_| Duration::from_millis(30));
+        assert_eq!(passage.delivery_time(), expected);
+    }
+}
+
+#[test]
 fn letters_are_reported_in_the_order_of_sending() {
     let (mut joiner, now) = (Joiner::new(), Instant::now());
     // The record of the answer arrives before that of the question.
@@ -288,7 +324,7 @@ fn each_letter_is_reported_once_and_in_order() {
                     Event::Letter(it) => {
                         reported.push((it.at, (it.stream.sender, it.sequence), it.fate.clone()));
                     }
-                    Event::Later(it) => {
+                    Event::Later(it) | Event::Confirmed(it) => {
                         let key = (it.stream.sender, it.sequence);
                         let first = reported
                             .iter_mut()

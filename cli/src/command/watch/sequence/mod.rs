@@ -6,7 +6,8 @@
 use unicode_width::UnicodeWidthChar;
 
 use super::conversations::{Conversation, Step};
-use super::text::{Ink, Look, cut};
+use super::text::{Ink, Look};
+use crate::output::cut;
 
 /// Minimum number of columns per lifeline.
 const MIN_SPACING: usize = 12;
