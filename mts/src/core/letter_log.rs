@@ -45,12 +45,19 @@ pub(crate) fn span(letter: LetterId) -> Span {
     tracing::debug_span!("letter", id = %letter)
 }
 
+/// Logs a line in the span of a letter. Not inlined: the code of the line would slow down its caller.
+#[cold]
+#[inline(never)]
+pub(crate) fn log_line(letter: LetterId, line: impl FnOnce()) {
+    span(letter).in_scope(line);
+}
+
 /// Logs a line in the span of a letter. The arguments behind the letter are those of `tracing::debug`; they are
 /// evaluated only if lines are logged.
 macro_rules! letter_debug {
     ($letter:expr, $($line:tt)+) => {
         if $crate::core::letter_log::is_enabled() {
-            $crate::core::letter_log::span($letter).in_scope(|| tracing::debug!($($line)+));
+            $crate::core::letter_log::log_line($letter, || tracing::debug!($($line)+));
         }
     };
 }
