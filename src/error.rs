@@ -92,6 +92,10 @@ pub enum OpenError {
     #[cfg(feature = "secure")]
     #[error("cannot use security.keys")]
     Keys(#[source] KeysError),
+    /// The key log that `security.key_log` asks for cannot be written.
+    #[cfg(feature = "secure")]
+    #[error("cannot use security.key_log")]
+    KeyLog(#[source] fipa_transport_net::secure::KeyLogError),
     /// The configuration has a key for a feature that this program was built without.
     #[error("this program was built without the feature `{feature}`, which {key} needs")]
     NoFeature {

@@ -44,8 +44,6 @@ mod mdns;
 mod platform;
 #[path = "../fuzz/src/quic.rs"]
 mod quic;
-#[path = "../fuzz/src/recording.rs"]
-mod recording;
 #[path = "../fuzz/src/seeds.rs"]
 mod seeds;
 #[path = "../fuzz/src/shm.rs"]
@@ -153,7 +151,7 @@ mod bodies {
 
     bodies!(
         access, actions, config, datagrams, delivery, exchange, framed, host, http, locking, mdns,
-        platform, quic, recording, shm, texts, udt
+        platform, quic, shm, texts, udt
     );
 
     #[test]

@@ -192,6 +192,11 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
             "run `fipa doctor`; keys belong to one gateway: use its name (--set mts.name=NAME), or make \
              new keys in an empty directory (`fipa keys init --dir DIRECTORY`)",
         ),
+        OpenError::KeyLog(_) => Failure::failed(
+            ErrorChain(&error).to_string(),
+            "$SSLKEYLOGFILE",
+            "set SSLKEYLOGFILE to a file that only this user can read, or remove security.key_log",
+        ),
         OpenError::DomainDir(DomainDirError::NotPrivate {
             path,
             problem,

@@ -19,6 +19,7 @@ use tokio::runtime;
 
 use crate::command::Command;
 use crate::complete;
+use crate::log::LogFormat;
 use crate::report::{self, Failure};
 
 /// Agent communication to the FIPA standards: through shared memory or Unix domain sockets on one
@@ -94,7 +95,9 @@ fn with_meant_command(mut error: clap::Error) -> clap::Error {
     };
     let tip = match word {
         "hz" | "bw" => Some("fipa subscribe NAME TOPIC --rate measures the rate of a topic"),
-        "bag" | "record" => Some("fipa watch --record FILE records letters"),
+        "bag" => Some(
+            "fipa record -o FILE records letters and topics, and fipa replay FILE replays them",
+        ),
         "service" | "services" | "call" => Some(
             "fipa request NAME CONTENT calls an agent, and fipa actions lists the actions of robots",
         ),
@@ -170,6 +173,7 @@ Environment:
                     /tmp/fipa-<user id>
   FIPA_STATE_DIR    directory of the state of `fipa own`; default: ~/.local/state/fipa
   RUST_LOG          log filter, for example fipa_mts=debug; overrides -v and -q
+  FIPA_LOG_FORMAT   format of the log, text or json; --log-format overrides it
   NO_COLOR          when set, the output has no colors
 
 Examples:
@@ -197,6 +201,16 @@ pub(crate) struct Global {
     /// Log only errors
     #[arg(short, long, help_heading = "Global options")]
     quiet: bool,
+
+    /// Format of the log on standard error [default: text]
+    #[arg(
+        long,
+        value_name = "FORMAT",
+        help_heading = "Global options",
+        hide_possible_values = true,
+        long_help = "Format of the log on standard error: text, or json for one object per line [default: text]"
+    )]
+    pub(crate) log_format: Option<LogFormat>,
 }
 
 impl Global {
@@ -210,6 +224,7 @@ impl Global {
             all.set.extend(inner.set);
             all.verbose = all.verbose.saturating_add(inner.verbose);
             all.quiet |= inner.quiet;
+            all.log_format = inner.log_format.or(all.log_format);
         }
         Ok(all)
     }

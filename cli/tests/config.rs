@@ -131,6 +131,7 @@ keys = \"\"                            # default
 insecure = false                     # default
 loopback = false                     # default
 legacy_peers = []                    # default
+key_log = false                      # default
 peer_connections = 64                # default
 peer_letters = 20000                 # default
 peer_bytes = \"256MiB\"                # default

@@ -477,7 +477,7 @@ fn words_of_other_tools_lead_to_the_command() {
         ("node", "'agents'"),
         ("hz", "tip: fipa subscribe NAME TOPIC --rate"),
         ("hz", "'subscribe', 'topics'"),
-        ("bag", "tip: fipa watch --record FILE"),
+        ("bag", "tip: fipa record -o FILE"),
         ("service", "tip: fipa request NAME CONTENT"),
         ("service", "'request', 'actions', 'df'"),
         ("run", "'up'"),

@@ -131,7 +131,7 @@ fn letters_of_all_processes_are_counted_and_stay_counted_when_these_end() {
 fn counters_survive_the_removal_of_their_files() {
     let host = Host::new();
     let shown = Shown::start(&host, "127.0.0.1:0");
-    let mut echo = host.echo("echo");
+    let mut echo = host.start(&["-v", "echo", "echo"]);
     let ping = ["ping", "echo", "--count", "10", "--interval", "1ms"];
     host.run(&ping).done();
     let received = letters("received", "shm", "delivered");

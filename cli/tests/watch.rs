@@ -7,11 +7,9 @@ mod common;
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::process::Stdio;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use common::{Host, Running};
-use fipa::monitor::recording::{self, Recorded};
-use fipa::{AgentId, Message, Performative};
 use serde_json::{Value, json};
 
 /// Starts `fipa watch --json` and waits until it watches all running processes.
@@ -379,79 +377,6 @@ fn say(host: &Host, act: &str, protocol: &str, id: &str) {
 }
 
 #[test]
-fn recorded_letters_are_judged_later() {
-    let host = Host::new();
-    let (good, bad) = (host.path("good.rec"), host.path("bad.rec"));
-    let (good, bad) = (good.to_str().unwrap(), bad.to_str().unwrap());
-    let _arm = host.echo("arm_1");
-    for (file, acts) in [
-        (good, &["cfp"][..]),
-        (bad, &["cfp", "inform", "accept-proposal"]),
-    ] {
-        // Filters do not apply to the recording.
-        let mut watching = watch(&host, &["--record", file]);
-        for act in acts {
-            say(&host, act, "fipa-contract-net", file);
-            next_of(&mut watching, "letter");
-        }
-        let (code, errors) = watching.signal("-INT");
-        assert_eq!((code, errors.as_str()), (Some(0), ""));
-    }
-    let shown = host.run(&["protocol", "replay", good]).done();
-    assert!(
-        shown.starts_with("letters: 1, accepted: 1, violations: 0,"),
-        "{shown}"
-    );
-    let replayed = host.run(&["protocol", "replay", bad, "--json"]);
-    assert_eq!(replayed.code, Some(1));
-    let lines = String::from_utf8(replayed.stdout).unwrap();
-    let lines: Vec<Value> = lines
-        .lines()
-        .map(|line| serde_json::from_str(line).unwrap())
-        .collect();
-    let events: Vec<&Value> = lines.iter().map(|line| &line["event"]).collect();
-    assert_eq!(events, ["violation", "violation", "summary"], "{lines:#?}");
-    assert_eq!(
-        (&lines[0]["number"], &lines[1]["number"]),
-        (&2.into(), &3.into())
-    );
-    assert_eq!(lines[1]["kind"], "out-of-order");
-    assert_eq!(
-        (&lines[2]["letters"], &lines[2]["violations"]),
-        (&3.into(), &2.into())
-    );
-    assert_eq!(lines[2]["complete"], true);
-    // Only another protocol is judged.
-    let other = ["protocol", "replay", bad, "--protocol", "fipa-request"];
-    let shown = host.run(&other).done();
-    assert!(shown.contains("violations: 0"), "{shown}");
-    let named = ["protocol", "replay", bad, "--protocol", "contractNet"];
-    assert_eq!(host.run(&named).code, Some(1));
-    // Files that are no recordings, and one that was not closed.
-    let file = fs::read(good).unwrap();
-    let cut = host.path("cut.rec");
-    fs::write(&cut, &file[..file.len() - 3]).unwrap();
-    let cut = host.run(&["protocol", "replay", cut.to_str().unwrap()]);
-    assert_eq!(cut.code, Some(0));
-    assert!(
-        cut.stderr.contains("ends within a letter"),
-        "{}",
-        cut.stderr
-    );
-    for (name, bytes) in [
-        ("no.rec", &b"<scxml/>"[..]),
-        ("huge.rec", b"fipa-rec\x01\0\0\0\xff\xff\xff\xff"),
-    ] {
-        let path = host.path(name);
-        fs::write(&path, bytes).unwrap();
-        let failed = host
-            .run(&["protocol", "replay", path.to_str().unwrap()])
-            .failed(1);
-        assert!(failed.contains(name), "{failed}");
-    }
-}
-
-#[test]
 fn conversations_that_may_have_begun_before_the_watching_are_unchecked() {
     let host = Host::new();
     let (mut rover, mut arm) = (
@@ -466,9 +391,10 @@ fn conversations_that_may_have_begun_before_the_watching_are_unchecked() {
         while next(agent)["event"] != "outcomes" {}
     };
     converse(&mut rover, "cfp", "arm", "earlier");
-    let file = host.path("late.rec");
+    let file = host.path("late.mcap");
     let file = file.to_str().unwrap();
-    let mut watching = watch(&host, &["--record", file]);
+    let mut recording = host.start(&["record", "-o", file]);
+    let mut watching = watch(&host, &[]);
     let mut verdicts = |agent: &mut Running, act: &str, to: &str, conversation: &str| {
         converse(agent, act, to, conversation);
         let seen = next_of(&mut watching, "letter");
@@ -493,64 +419,14 @@ fn conversations_that_may_have_begun_before_the_watching_are_unchecked() {
     assert_eq!(verdicts(&mut crane, "propose", "arm", "other"), "violation");
     let (code, errors) = watching.signal("-INT");
     assert_eq!((code, errors.as_str()), (Some(0), ""));
-    // The recording has the same verdicts.
-    let replayed = host.run(&["protocol", "replay", file]);
+    // A recording has the same verdicts.
+    recording.send_signal("-INT");
+    assert_eq!(recording.end(), (Some(0), String::new()));
+    let replayed = host.run(&["replay", file, "--check"]);
     assert_eq!(replayed.code, Some(1));
     let shown = String::from_utf8(replayed.stdout).unwrap();
     let summary = "letters: 5, accepted: 1, violations: 2, unchecked: 2, not judged: 0";
     assert_eq!(shown.lines().last(), Some(summary), "{shown}");
-}
-
-#[test]
-fn letters_that_were_lost_make_no_violations() {
-    // A recording with a loss between the opening and the inform.
-    let message = |act: Performative, from: &str, to: &str| {
-        let agent = |name| AgentId::new(name).unwrap();
-        let message = Message::builder(act)
-            .sender(agent(from))
-            .receiver(agent(to))
-            .protocol("fipa-contract-net")
-            .conversation_id("c");
-        message.build().unwrap()
-    };
-    let written = |after_loss: bool| {
-        let mut file = Vec::new();
-        recording::begin(&mut file);
-        for (number, message) in [
-            message(Performative::Cfp, "rover", "arm"),
-            message(Performative::Inform, "arm", "rover"),
-        ]
-        .into_iter()
-        .enumerate()
-        {
-            let recorded = Recorded {
-                at: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000),
-                answer_within: None,
-                receiver: message.receivers()[0].name().to_owned(),
-                undelivered: false,
-                from_service: false,
-                may_continue: true,
-                after_loss: after_loss && number == 1,
-                message: Some(message),
-            };
-            recording::append(&recorded, &mut file).unwrap();
-        }
-        file
-    };
-    let host = Host::new();
-    let judged = |after_loss| {
-        let file = written(after_loss);
-        let ran = host.run_with_input(&["protocol", "replay", "-"], &file);
-        (ran.code, String::from_utf8(ran.stdout).unwrap())
-    };
-    let (code, shown) = judged(true);
-    assert_eq!(code, Some(0), "{shown}");
-    assert!(
-        shown.contains("accepted: 1, violations: 0, unchecked: 1"),
-        "{shown}"
-    );
-    let (code, shown) = judged(false);
-    assert_eq!(code, Some(1), "{shown}");
 }
 
 #[test]

@@ -14,7 +14,6 @@ pub mod locking;
 pub mod mdns;
 pub mod platform;
 pub mod quic;
-pub mod recording;
 pub mod seeds;
 pub mod shm;
 pub mod texts;

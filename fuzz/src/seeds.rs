@@ -41,7 +41,6 @@ pub fn of(target: &str) -> Vec<Vec<u8>> {
             seeds
         }
         "http" => crate::http::seeds(),
-        "recording" => crate::recording::seeds(),
         "gateway_state" => vec![GATEWAY_STATE.to_vec()],
         "presence" => {
             let mut seeds = drawn(24, 200);

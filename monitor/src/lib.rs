@@ -3,7 +3,6 @@
 //! * [`Machine`]: a protocol, read from an SCXML file (see [`scxml`] for the format).
 //! * [`projection`]: protocols with three or more roles, as each role sees them.
 //! * [`Library`]: protocols by name. [`Library::standard`] has those of FIPA.
-//! * [`recording`]: letters in a file, to be checked later.
 //! * [`Monitor`]: checks the messages of any number of conversations, as an observer or for one
 //!   participating agent, and returns a [`Verdict`] for each. It reads a [`Header`], without the
 //!   content.
@@ -25,7 +24,6 @@ mod limits;
 mod monitor;
 mod policy;
 mod protocol;
-pub mod recording;
 mod snapshot;
 mod verdict;
 

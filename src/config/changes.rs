@@ -19,7 +19,7 @@ pub struct Reloaded {
 }
 
 /// The keys that only gateways use, as they begin.
-const OF_GATEWAY: [&str; 15] = [
+const OF_GATEWAY: [&str; 16] = [
     "mts.name",
     "transport.tcp.listen",
     "transport.udp.",
@@ -32,6 +32,7 @@ const OF_GATEWAY: [&str; 15] = [
     "security.insecure",
     "security.loopback",
     "security.legacy_peers",
+    "security.key_log",
     "http.",
     "contacts.",
     "platform.",

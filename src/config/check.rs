@@ -261,6 +261,13 @@ impl Findings {
                 "remove udp; tcp and quic are encrypted if security.keys is set",
             );
         }
+        if !has_keys && security.key_log {
+            self.combined(
+                &["security", "key_log"],
+                "is true, but without keys no connection is encrypted",
+                "make keys (`fipa keys init`) and set security.keys, or remove key_log",
+            );
+        }
         if !has_keys && config.mts.transports.contains(&Kind::Quic) {
             self.combined(
                 &["mts", "transports"],

@@ -290,6 +290,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.security.legacy_peers),
     },
     Key {
+        path: &["security", "key_log"],
+        shape: Shape::Plain,
+        expected: "true or false",
+        write: |config, value| truth(value).map(|log| config.security.key_log = log),
+        read: |config| Value::Truth(config.security.key_log),
+    },
+    Key {
         path: &["security", "peer_connections"],
         shape: Shape::Plain,
         expected: "a number of connections such as 64",

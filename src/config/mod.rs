@@ -48,6 +48,7 @@
 //! insecure = false                    # true: listen on the network without keys
 //! loopback = false                    # with keys: legacy peers on loopback prove their identity, too
 //! legacy_peers = []                   # with keys: addresses of legacy peers, which have no keys
+//! key_log = false                     # with SSLKEYLOGFILE: write the secrets of TLS there, for Wireshark
 //! [http]
 //! listen = ""                         # of the gateway, for Prometheus: "127.0.0.1:9790"; empty: off
 //! names = []                          # further names under which clients reach that address
@@ -292,6 +293,9 @@ pub struct Security {
     /// `legacy_peers`: addresses of legacy peers, which cannot prove their identity. The gateway exchanges
     /// letters in their dialects with them despite its keys. At most 64.
     pub legacy_peers: Vec<IpAddr>,
+    /// `key_log`: whether the gateway writes the secrets of its TLS connections to the file that the environment
+    /// variable `SSLKEYLOGFILE` names. A reader of the file can decrypt captured letters.
+    pub key_log: bool,
     /// `peer_connections`: maximum number of connections of each transport from the peers with one
     /// certificate, or from one address if the peer has no keys. This and the next two limits apply
     /// to other hosts, and to loopback addresses if those must prove their identity.
@@ -539,6 +543,7 @@ impl Config {
                 insecure: false,
                 loopback: false,
                 legacy_peers: Vec::new(),
+                key_log: false,
                 peer_connections: 64,
                 peer_letters: 20_000,
                 peer_bytes: 256 << 20,

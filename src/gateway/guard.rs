@@ -1,11 +1,13 @@
 //! The guard reads the gateway's keys when the gateway opens, and again when their directory
 //! changes.
 
+use std::ffi::OsStr;
+use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::ErrorChain;
 use fipa_transport::log_limit;
-use fipa_transport_net::secure::{Credentials, Rules, Security};
+use fipa_transport_net::secure::{Credentials, KeyLog, Rules, Security};
 use tokio::runtime::Handle;
 
 use crate::admin::keys::{Holding, Keys, Stamp, Whose};
@@ -15,6 +17,30 @@ use crate::error::OpenError;
 
 /// Interval between checks for changed keys. A check makes three system calls.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Environment variable with the path of the key log, the same as of other programs with TLS.
+const KEY_LOG_VARIABLE: &str = "SSLKEYLOGFILE";
+
+/// Makes the transports write their secrets to this file.
+fn log_keys(security: &Security, path: Option<&OsStr>) -> Result<(), OpenError> {
+    let Some(path) = path.filter(|path| !path.is_empty()) else {
+        log_limit::warn!(
+            "security.key_log is true, but the environment variable {KEY_LOG_VARIABLE} is not set; no secrets are \
+             written; set it to the path of a file"
+        );
+        return Ok(());
+    };
+    let path = Path::new(path);
+    let key_log = KeyLog::append_to(path).map_err(OpenError::KeyLog)?;
+    let logging = security.log_keys(key_log);
+    logging.map_err(|error| OpenError::Keys(error.into()))?;
+    log_limit::warn!(
+        path = %path.display(),
+        "the secrets of TLS connections are written to the key log: everyone who reads this file can decrypt captured \
+         letters; remove security.key_log and the file after the capture"
+    );
+    Ok(())
+}
 
 /// Logs the certificates that are not valid or expire soon.
 fn warn_about_expiry(credentials: &Credentials) {
@@ -66,6 +92,9 @@ impl Guard {
         };
         let security = Security::new(credentials, rules);
         let security = security.map_err(|error| OpenError::Keys(error.into()))?;
+        if config.key_log {
+            log_keys(&security, std::env::var_os(KEY_LOG_VARIABLE).as_deref())?;
+        }
         Ok(Some(Self {
             keys,
             name: name.to_owned(),

@@ -26,7 +26,9 @@ mod own;
 mod ping;
 mod protocol;
 mod publish;
+mod record;
 mod reload;
+mod replay;
 mod request;
 mod routes;
 mod send;
@@ -67,6 +69,8 @@ pub(crate) enum Command {
     Reload(reload::Arguments),
     Watch(Box<watch::Arguments>),
     Top(top::Arguments),
+    Record(Box<record::Arguments>),
+    Replay(Box<replay::Arguments>),
     Demo(demo::Arguments),
     Doctor(doctor::Arguments),
     #[cfg(feature = "bench")]
@@ -109,6 +113,8 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Reload(arguments) => reload::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Top(arguments) => top::run(arguments, global),
+        Command::Record(arguments) => record::run(*arguments, global),
+        Command::Replay(arguments) => replay::run(&arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
         Command::Doctor(arguments) => doctor::run(arguments, global),
         #[cfg(feature = "bench")]

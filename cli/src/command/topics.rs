@@ -80,7 +80,7 @@ const INTERVAL: Duration = Duration::from_secs(1);
 const CLEAR: &str = "\x1b[2J\x1b[H";
 
 /// The topics of agents by name; `None` if an agent does not answer.
-type Listed = BTreeMap<String, Option<Vec<TopicStatus>>>;
+pub(super) type Listed = BTreeMap<String, Option<Vec<TopicStatus>>>;
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
@@ -208,7 +208,7 @@ pub(crate) fn tip_for_one_argument(name: &str, sources: &Sources) -> Option<Stri
 }
 
 /// Lists the topics of all agents that publish some.
-async fn list_all(agent: &Arc<Agent>, config: &Config) -> Result<Listed, Failure> {
+pub(super) async fn list_all(agent: &Arc<Agent>, config: &Config) -> Result<Listed, Failure> {
     match agent.df() {
         Ok(df) => {
             let topics = AgentDescription {

@@ -60,6 +60,7 @@ mod lane;
 mod lane_budget;
 mod lane_table;
 mod lanes;
+pub(crate) mod letter_log;
 mod limits;
 mod network;
 mod notes;

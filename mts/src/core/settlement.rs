@@ -10,6 +10,7 @@ use super::News;
 use super::action::Action;
 use super::lane::OpenLetter;
 use super::lane_table::LaneTable;
+use super::letter_log::{LetterId, letter_debug};
 use super::notes::{Note, note_parcel};
 use super::origin::{Origin, Settlement, Upstream};
 
@@ -40,6 +41,7 @@ impl LaneTable {
                 }
                 Origin::FailureMessage => counts.event(Event::FailureMessage, 1),
             }
+            letter_debug!(LetterId::new(stream, sequence), %receiver, %outcome, "settled");
             self.notice(stream, sequence, &receiver, || News::Settled {
                 outcome: outcome.clone(),
                 sender: !matches!(origin, Origin::Forwarded { .. }),

@@ -12,6 +12,7 @@ use super::action::Action;
 use super::ids::{SubmissionId, registration_of};
 use super::lane::OpenLetter;
 use super::lanes::own_lane;
+use super::letter_log::{LetterId, letter_debug};
 use super::origin::Origin;
 use super::undelivered::{FailureTarget, Undelivered};
 use super::waiting::Unresolved;
@@ -353,6 +354,7 @@ impl Core {
         }
         self.table.counts().event(Event::Submitted, 1);
         let sequence = self.sequence_of(sender);
+        letter_debug!(LetterId::new(stream, sequence), receiver = %name, bytes = letter.len(), "sent");
         self.table.notice(stream, sequence, name, || News::Sent {
             submission: Some(submission),
             letter: letter.clone(),

@@ -24,18 +24,21 @@ use fipa_acl::{AgentId, Letter};
 use fipa_sds::{Change, Directory, Entry, View};
 use fipa_transport::counts::SharedCounts;
 use fipa_transport::{
-    Abandoned, Attempt, Conclusion, Incarnation, Introduction, Kind, ListenError, Location,
-    Outcome, OwnerProcess, Principal, Transport, TransportError, TransportErrorKind, log_limit,
+    Abandoned, Attempt, Body, Conclusion, Incarnation, Introduction, Kind, ListenError, Location,
+    Outcome, OwnerProcess, Parcel, Principal, Transport, TransportError, TransportErrorKind,
+    log_limit,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinHandle;
+use tracing::Span;
 
 use self::clocks::Clocks;
 use self::receiving::TransportSink;
 use crate::AccessGate;
 use crate::Map;
+use crate::core::letter_log::{self, LetterId};
 use crate::core::{
     Action, Core, CoreConfig, LetterReader, Notice, Now, Peer, PeerState, Received, Route,
     RouteException, RouteState, Submission, SubmissionId, Undecodable,
@@ -774,9 +777,14 @@ impl Shared {
                     location,
                     parcel,
                 } => {
-                    let result = match self.transport(location.kind()) {
+                    let span = letter_log::is_enabled().then(|| dispatch_span(&parcel, &location));
+                    let post = || match self.transport(location.kind()) {
                         Some(transport) => transport.post(attempt, &location, parcel),
                         None => Err(no_such_transport(location.kind())),
+                    };
+                    let result = match span {
+                        Some(span) => span.in_scope(post),
+                        None => post(),
                     };
                     if let Err(error) = result {
                         let conclusion = Conclusion::NotSent(error);
@@ -948,6 +956,24 @@ impl State {
             self.submissions.remove(&submission);
         }
     }
+}
+
+/// Logs that a parcel is passed to a transport. Returns the span for what the transport logs about it.
+#[cold]
+fn dispatch_span(parcel: &Parcel, location: &Location) -> Span {
+    let span = letter_log::span(LetterId::new(parcel.stream, parcel.sequence));
+    let receiver = &parcel.receiver;
+    span.in_scope(|| match &parcel.body {
+        Body::Letter(_) => tracing::debug!(%location, %receiver, "dispatching"),
+        Body::Report(report) => tracing::debug!(%location, ?report, "reporting"),
+        Body::Credit => {
+            tracing::debug!(%location, %receiver, "asking for more letters of the stream")
+        }
+        Body::Predecessor => {
+            tracing::debug!(%location, after = parcel.after, "changing the predecessor")
+        }
+    });
+    span
 }
 
 fn no_such_transport(kind: Kind) -> TransportError {

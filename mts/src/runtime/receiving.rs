@@ -13,6 +13,7 @@ use parking_lot::MutexGuard;
 
 use super::Shared;
 use crate::core::Unframed;
+use crate::core::letter_log::{LetterId, letter_debug};
 
 /// The sink of one transport.
 pub(super) struct TransportSink {
@@ -31,8 +32,12 @@ impl Sink for TransportSink {
             return closing();
         }
         let Parcel {
-            stream, receiver, ..
+            stream,
+            receiver,
+            sequence,
+            ..
         } = &arrival.parcel;
+        let letter = LetterId::new(*stream, *sequence);
         if state.core.misses(stream.receiver, receiver) {
             drop(state);
             shared.directory.refresh();
@@ -42,6 +47,7 @@ impl Sink for TransportSink {
         let reaction = state
             .core
             .handle_read_arrival(now, self.kind, arrival, read);
+        letter_debug!(letter, via = %self.kind, ?reaction, "arrived");
         shared.carry_out(state);
         reaction
     }

@@ -5,6 +5,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
+use fipa_transport::counts::{Direction, Event, LetterOutcome};
 use fipa_transport::{Attempt, FailureReason, Incarnation, Outcome, Parcel};
 
 use super::links::transfer_time;
@@ -57,6 +58,8 @@ pub(crate) enum Invariant {
     Repetitions,
     /// Without any fault no letter fails, and each failure is reported.
     Calm,
+    /// The counters of a process agree with its queues and with the letters that it sent.
+    Counted,
 }
 
 impl fmt::Display for Invariant {
@@ -264,7 +267,33 @@ impl World {
         }
     }
 
+    /// Checks the counters at the end, when each letter has its outcome.
+    fn check_counters(&mut self) {
+        let mut breaches = Vec::new();
+        for process in self.processes.iter().filter(|it| it.alive && !it.hostile) {
+            let totals = process.counts.totals();
+            let outcomes = LetterOutcome::ALL.into_iter();
+            let settled: u64 = outcomes
+                .map(|outcome| totals.all_letters(Direction::Sent, outcome))
+                .sum();
+            let submitted = totals.events(Event::Submitted);
+            let taken = totals.all_letters(Direction::Received, LetterOutcome::Delivered);
+            let read = totals.events(Event::Read);
+            let agents = process.agents.iter();
+            let queued: usize = agents.map(|(_, agent)| process.core.waiting(*agent)).sum();
+            if submitted != settled || taken.checked_sub(read) != Some(queued as u64) {
+                breaches.push(format!(
+                    "{submitted} submitted and {settled} settled; {taken} taken, {read} read and {queued} queued"
+                ));
+            }
+        }
+        for text in breaches {
+            self.breach(Invariant::Counted, || text);
+        }
+    }
+
     pub(super) fn check_end(&mut self) {
+        self.check_counters();
         let mut failed = 0;
         let mut breaches = Vec::new();
         for (number, sent) in &self.sent {

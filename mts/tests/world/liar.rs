@@ -106,6 +106,7 @@ impl World {
                 hostile: true,
                 incarnation,
                 core: Core::new(config, Arc::new(view)),
+                counts: Arc::default(),
                 agents: Vec::new(),
                 open: std::collections::BTreeMap::new(),
                 tickets: super::Map::default(),

@@ -19,6 +19,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_mts::core::{Action, Core, CoreConfig, Now, SubmissionId};
 use fipa_sds::{Entry, Role};
+use fipa_transport::counts::{Counts, SharedCounts};
 use fipa_transport::{AttemptId, Conclusion, Incarnation, Kind, Ticket};
 use parking_lot::Mutex;
 
@@ -55,6 +56,7 @@ struct Process {
     hostile: bool,
     incarnation: Incarnation,
     core: Core,
+    counts: Arc<Counts>,
     agents: Vec<(Arc<str>, Incarnation)>,
     /// Attempts without a conclusion; the death of their receiver breaks them off.
     open: BTreeMap<AttemptId, Flight>,
@@ -393,12 +395,15 @@ impl World {
             gateway,
             mts: incarnation,
         };
+        let counts = Arc::new(Counts::default());
+        let core = Core::new(config, Arc::new(view)).gated(Arc::new(self.rules(host, gateway)));
         let mut process = Process {
             host,
             gateway,
             hostile: false,
             incarnation,
-            core: Core::new(config, Arc::new(view)).gated(Arc::new(self.rules(host, gateway))),
+            core: core.counting(Arc::clone(&counts) as SharedCounts),
+            counts,
             agents: Vec::new(),
             open: BTreeMap::new(),
             tickets: Map::default(),

@@ -324,7 +324,7 @@ impl DirChanges {
             self.lost = true;
         }
         match name.and_then(Name::parse) {
-            Some(Name::Entries(_) | Name::Remote(_) | Name::Domain)
+            Some(Name::Entries(_) | Name::Remote(_) | Name::Counts(_) | Name::Domain)
                 if mask.contains(EventMask::DELETE) =>
             {
                 self.disturbed = true;

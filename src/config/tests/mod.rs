@@ -370,6 +370,7 @@ keys = ""                            # default
 insecure = false                     # default
 loopback = false                     # default
 legacy_peers = []                    # default
+key_log = false                      # default
 peer_connections = 64                # default
 peer_letters = 20000                 # default
 peer_bytes = "256MiB"                # default
@@ -603,5 +604,7 @@ fn a_gateway_listens_on_the_network_only_with_keys_or_with_insecure() {
     assert!(mistakes(&["security.keys=~/keys"]).contains("only shells expand"));
     let keys = "security.keys=/etc/fipa/keys";
     assert!(mistakes(&[keys, "security.insecure=true"]).contains("`security.insecure`"));
+    assert_eq!(mistakes(&[keys, "security.key_log=true"]), "");
+    assert!(mistakes(&["security.key_log=true"]).contains("no connection is encrypted"));
     assert!(mistakes(&[keys, "mts.transports=shm,udp,tcp"]).contains("not encrypted"));
 }

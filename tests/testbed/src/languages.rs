@@ -117,6 +117,31 @@ pub fn ros2_pythons(name: &str) -> Vec<String> {
     }
 }
 
+/// Returns a Python with the package `mcap` of PyPI: the one that the environment variable `FIPA_MCAP` names, or that of
+/// `target/mcap`. If the test `name` cannot run, prints a note, or panics if `CI=true`.
+///
+/// # Panics
+/// If the test cannot run and `CI=true`.
+#[must_use]
+pub fn mcap_python(name: &str) -> Option<String> {
+    let built = libraries();
+    let built = built
+        .ancestors()
+        .nth(2)
+        .map(|target| target.join("mcap/bin/python"));
+    let built = built.filter(|python| python.exists());
+    let named = std::env::var("FIPA_MCAP").ok();
+    let python = named.or_else(|| built.map(|python| python.to_string_lossy().into_owned()));
+    let missing = match &python {
+        Some(_) => Vec::new(),
+        None => vec!["the package mcap for Python: `export FIPA_MCAP=$(.ci/mcap)`"],
+    };
+    match is_complete(name, &missing) {
+        true => python,
+        false => None,
+    }
+}
+
 /// Puts the package `fipa` for Python into a directory, with the module that cargo has built.
 pub fn install_package(into: &Path) {
     let to = into.join("fipa");

@@ -9,6 +9,7 @@
 //! * `certificate`: the contents of a certificate.
 //! * `advice`: remedies when a peer is not trusted.
 //! * `verify`: the verification of a presented certificate.
+//! * `key_log`: the file that receives the secrets of connections, if the owner of the host asks for it.
 //! * `platform`: the same for platforms that are reached over `https`, and their authorities.
 //! * `trust`: the trust in the peer of a connection, for as long as the connection is open.
 //!
@@ -16,6 +17,7 @@
 
 pub(crate) mod advice;
 mod certificate;
+mod key_log;
 #[cfg(feature = "http")]
 mod platform;
 mod trust;
@@ -36,6 +38,7 @@ use tokio::sync::watch;
 pub use self::certificate::{
     Certificate, CertificateError, Certified, Fingerprint, alternative_names,
 };
+pub use self::key_log::{KeyLog, KeyLogError};
 #[cfg(feature = "http")]
 pub use self::platform::{Authorities, AuthoritiesError};
 use self::trust::Evidence;
@@ -93,6 +96,7 @@ struct Prepared {
     own: Certificate,
     key: PrivateKeyDer<'static>,
     known: Arc<Known>,
+    key_log: Arc<dyn rustls::KeyLog>,
     server: Arc<ServerConfig>,
     client: Arc<ClientConfig>,
 }
@@ -116,7 +120,7 @@ impl Security {
     /// # Errors
     /// When the credentials cannot be used; the previous ones stay in use.
     pub fn replace(&self, credentials: Credentials) -> Result<(), CredentialsError> {
-        self.change(|now| Prepared::after(&now.known, credentials))
+        self.change(|now| Prepared::after(&now.known, credentials, &now.key_log))
     }
 
     /// Replaces the trusted peers, and keeps the key and certificate. These certificates are revoked in
@@ -133,7 +137,19 @@ impl Security {
             revoked.extend(now.known.revoked());
             let own = now.own.fingerprint();
             let known = now.known.with_certificates(own, trusted, revoked);
-            Prepared::with(now.own.clone(), now.key.clone_key(), known)
+            Prepared::with(now.own.clone(), now.key.clone_key(), known, &now.key_log)
+        })
+    }
+
+    /// Writes the secrets of all later connections to a key log.
+    ///
+    /// # Errors
+    /// When the credentials cannot be used any more; the previous state stays.
+    pub fn log_keys(&self, key_log: KeyLog) -> Result<(), CredentialsError> {
+        let key_log: Arc<dyn rustls::KeyLog> = Arc::new(key_log);
+        self.change(|now| {
+            let known = Arc::clone(&now.known);
+            Prepared::with_known(now.own.clone(), now.key.clone_key(), known, &key_log)
         })
     }
 
@@ -145,7 +161,7 @@ impl Security {
     pub fn set_authorities(&self, authorities: Authorities) -> Result<(), CredentialsError> {
         self.change(|now| {
             let known = now.known.with_authorities(authorities);
-            Prepared::with(now.own.clone(), now.key.clone_key(), known)
+            Prepared::with(now.own.clone(), now.key.clone_key(), known, &now.key_log)
         })
     }
 
@@ -208,6 +224,7 @@ impl Security {
             .with_client_cert_verifier(Arc::new(platform::AnyClient::new(&now.known)))
             .with_single_cert(vec![now.own.der().clone()], now.key.clone_key())?;
         server.send_tls13_tickets = 0;
+        server.key_log = Arc::clone(&now.key_log);
         Ok(Arc::new(server))
     }
 
@@ -224,6 +241,7 @@ impl Security {
             .with_custom_certificate_verifier(Arc::new(verifier))
             .with_client_auth_cert(vec![now.own.der().clone()], now.key.clone_key())?;
         client.resumption = Resumption::disabled();
+        client.key_log = Arc::clone(&now.key_log);
         Ok(Arc::new(client))
     }
 
@@ -302,11 +320,16 @@ impl fmt::Debug for Security {
 impl Prepared {
     fn new(credentials: Credentials) -> Result<Self, CredentialsError> {
         let nothing = Known::of(credentials.own.fingerprint());
-        Self::after(&nothing, credentials)
+        let no_log: Arc<dyn rustls::KeyLog> = Arc::new(rustls::NoKeyLog);
+        Self::after(&nothing, credentials, &no_log)
     }
 
     /// Prepares credentials that take the place of earlier ones, whose authorities stay.
-    fn after(before: &Known, credentials: Credentials) -> Result<Self, CredentialsError> {
+    fn after(
+        before: &Known,
+        credentials: Credentials,
+        key_log: &Arc<dyn rustls::KeyLog>,
+    ) -> Result<Self, CredentialsError> {
         let Credentials {
             own,
             key,
@@ -314,16 +337,25 @@ impl Prepared {
             revoked,
         } = credentials;
         let known = before.with_certificates(own.fingerprint(), trusted, revoked);
-        Self::with(own, key, known)
+        Self::with(own, key, known, key_log)
     }
 
     fn with(
         own: Certificate,
         key: PrivateKeyDer<'static>,
         known: Known,
+        key_log: &Arc<dyn rustls::KeyLog>,
+    ) -> Result<Self, CredentialsError> {
+        Self::with_known(own, key, Arc::new(known), key_log)
+    }
+
+    fn with_known(
+        own: Certificate,
+        key: PrivateKeyDer<'static>,
+        known: Arc<Known>,
+        key_log: &Arc<dyn rustls::KeyLog>,
     ) -> Result<Self, CredentialsError> {
         let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let known = Arc::new(known);
         let chain = vec![own.der().clone()];
         let mut server = ServerConfig::builder_with_provider(provider.clone())
             .with_protocol_versions(&[&TLS13])?
@@ -338,10 +370,13 @@ impl Prepared {
         server.send_tls13_tickets = 0;
         client.resumption = Resumption::disabled();
         client.enable_sni = false;
+        server.key_log = Arc::clone(key_log);
+        client.key_log = Arc::clone(key_log);
         Ok(Self {
             own,
             key,
             known,
+            key_log: Arc::clone(key_log),
             server: Arc::new(server),
             client: Arc::new(client),
         })

@@ -3,7 +3,6 @@
 mod defaults;
 mod drawing;
 mod mermaid;
-mod replay;
 
 use std::path::{Path, PathBuf};
 
@@ -20,7 +19,7 @@ use crate::options::Global;
 use crate::output;
 use crate::report::{self, Failure};
 
-/// List, show, export, check and draw interaction protocols, and judge recorded letters
+/// List, show, export, check and draw interaction protocols
 ///
 /// The protocols of the FIPA standards are built in. Files in `monitor.protocols` of the
 /// configuration take precedence over them. A file is SCXML in the format of fipa_acl. Attributes in
@@ -34,7 +33,8 @@ Examples:
   fipa protocol check protocols/*.scxml
   fipa protocol draw fipa-request --output request.svg
   fipa protocol draw my.scxml --format mermaid
-  fipa protocol replay letters.rec")]
+
+`fipa replay FILE --check` judges recorded letters.")]
 pub(crate) enum Arguments {
     /// List the known protocols with their aliases
     #[command(after_help = "\
@@ -137,24 +137,6 @@ Examples:
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
     },
-
-    /// Judge the letters of a recording
-    ///
-    /// Reads a file of `fipa watch --record` and checks every letter against the protocol of its
-    /// conversation. Prints the violations. The exit code is 1 if there is one, or if the file is
-    /// no recording.
-    #[command(after_help = "\
-Examples:
-  fipa watch --record letters.rec
-  fipa protocol replay letters.rec
-  fipa protocol replay letters.rec --protocol fipa-contract-net
-  fipa protocol replay letters.rec --protocol my.scxml --json
-
-JSON, one object on a line:
-  { \"event\": \"violation\", \"number\": of the letter, \"time\", \"kind\", \"text\" }
-  { \"event\": \"summary\", \"letters\", \"accepted\", \"violations\", \"unchecked\",
-    \"excluded\", \"complete\": false if the file ends within a letter }")]
-    Replay(replay::Arguments),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -190,7 +172,6 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             };
             write(&drawn, output)
         }
-        Arguments::Replay(arguments) => replay::run(&arguments, global),
     }
 }
 
@@ -221,7 +202,7 @@ fn exported(named: &str, global: &Global) -> Result<String, Failure> {
 }
 
 /// Loads the protocols of the standards and of the configuration.
-fn library(global: &Global) -> Result<Library, Failure> {
+pub(super) fn library(global: &Global) -> Result<Library, Failure> {
     let mut library = Library::standard();
     for file in &global.config()?.monitor.protocols {
         let machine = read(Path::new(file))?;
@@ -237,7 +218,7 @@ fn library(global: &Global) -> Result<Library, Failure> {
 }
 
 /// Finds a known protocol by its name, else reads the file of that name.
-fn find(named: &str, global: &Global) -> Result<Machine, Failure> {
+pub(super) fn find(named: &str, global: &Global) -> Result<Machine, Failure> {
     let path = Path::new(named);
     let library = library(global)?;
     match library.find(named) {

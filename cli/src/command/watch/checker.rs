@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fipa::admin::watch::{Fate, Passage};
-use fipa::{DeliveryFailure, DirectoryView, Message, Outcome};
+use fipa::{DeliveryFailure, DirectoryView, Entry, Message, Outcome};
 use fipa_acl::Time;
 use fipa_monitor::{
     Event, Header, History, Library, LibraryError, Monitor, Unchecked, Verdict, Violation,
@@ -49,7 +49,7 @@ impl CheckResult {
         matches!(self, Self::Violation(_))
     }
 
-    pub(super) fn protocol(&self) -> Option<&str> {
+    pub(in crate::command) fn protocol(&self) -> Option<&str> {
         match self {
             Self::Accepted { protocol, .. } => Some(protocol),
             Self::Violation(violation) => Some(&violation.protocol),
@@ -59,21 +59,11 @@ impl CheckResult {
 }
 
 /// A message that the protocol requires and that did not arrive in time.
-pub(super) struct Overdue {
-    pub(super) protocol: String,
-    pub(super) conversation_id: String,
-    pub(super) participant: Option<String>,
-    pub(super) state: String,
-}
-
-impl Overdue {
-    pub(super) fn protocol(&self) -> Option<&str> {
-        Some(&self.protocol)
-    }
-
-    pub(super) fn conversation(&self) -> Option<&str> {
-        Some(&self.conversation_id)
-    }
+pub(in crate::command) struct Overdue {
+    pub(in crate::command) protocol: String,
+    pub(in crate::command) conversation_id: String,
+    pub(in crate::command) participant: Option<String>,
+    pub(in crate::command) state: String,
 }
 
 /// Maximum size of a protocol file, in bytes.
@@ -133,7 +123,11 @@ impl Earlier {
     /// Adds the agents that are registered now.
     pub(in crate::command) fn add(&mut self, directory: DirectoryView<'_>) {
         directory.refresh();
-        let entries = directory.entries();
+        self.add_entries(&directory.entries());
+    }
+
+    /// Adds the agents of these entries.
+    pub(in crate::command) fn add_entries(&mut self, entries: &[Arc<Entry>]) {
         self.names
             .extend(entries.iter().map(|entry| Arc::clone(&entry.name)));
     }
@@ -226,7 +220,7 @@ impl Checker {
     }
 
     /// Returns the messages that have become overdue by `now`.
-    pub(super) fn handle_timeout(&mut self, now: SystemTime) -> Vec<Overdue> {
+    pub(in crate::command) fn handle_timeout(&mut self, now: SystemTime) -> Vec<Overdue> {
         if self.monitor.poll_timeout().is_none_or(|due| due > now) {
             return Vec::new();
         }

@@ -1,7 +1,7 @@
 //! Output of `fipa watch` as JSON, one object per line.
 
 use fipa::admin::watch::{Fate, Passage};
-use fipa::{Attempt, MessageBuilder, Outcome, Time};
+use fipa::{Attempt, Message, MessageBuilder, Outcome, Time};
 use fipa_acl::json::{letter_to_json, message_to_json};
 use serde_json::{Map, Value, json};
 
@@ -18,6 +18,14 @@ pub(super) fn watching(domain: &str, processes: usize) -> String {
 }
 
 pub(super) fn letter(passage: &Passage, checked: &CheckResult) -> String {
+    line(&Value::Object(letter_object(passage, checked)))
+}
+
+/// The object of a letter.
+pub(in crate::command) fn letter_object(
+    passage: &Passage,
+    checked: &CheckResult,
+) -> Map<String, Value> {
     let message = passage.message.as_ref();
     let cut = passage
         .content_len
@@ -60,10 +68,15 @@ pub(super) fn letter(passage: &Passage, checked: &CheckResult) -> String {
     fate(&mut object, &passage.fate);
     object.insert("verdict".to_owned(), verdict(checked));
     object.insert("letter".to_owned(), contents(passage));
-    line(&Value::Object(object))
+    object
 }
 
 pub(super) fn later(passage: &Passage) -> String {
+    line(&Value::Object(later_object(passage)))
+}
+
+/// The object of a later outcome.
+pub(in crate::command) fn later_object(passage: &Passage) -> Map<String, Value> {
     let mut object = Map::new();
     object.insert("event".to_owned(), "outcome".into());
     object.insert("number".to_owned(), passage.number.into());
@@ -75,7 +88,7 @@ pub(super) fn later(passage: &Passage) -> String {
         object.insert("via".to_owned(), via.name().into());
     }
     fate(&mut object, &passage.fate);
-    line(&Value::Object(object))
+    object
 }
 
 fn fate(object: &mut Map<String, Value>, fate: &Fate) {
@@ -144,19 +157,21 @@ fn verdict(checked: &CheckResult) -> Value {
     }
 }
 
+/// The message with the observed part of its content.
+pub(in crate::command) fn message(passage: &Passage) -> Option<Message> {
+    let message = passage.message.clone()?;
+    if passage.content.is_empty() {
+        return Some(message);
+    }
+    let bare = message.clone();
+    let with = MessageBuilder::from(message).content(passage.content.clone());
+    // A valid message stays valid with any content.
+    Some(with.build().unwrap_or(bare))
+}
+
 /// The observed parts of the letter, in the format of `fipa decode`.
 fn contents(passage: &Passage) -> Value {
-    let message = passage.message.clone().map(|message| {
-        let bare = message.clone();
-        match passage.content.is_empty() {
-            true => message,
-            // A valid message stays valid with any content.
-            false => MessageBuilder::from(message)
-                .content(passage.content.clone())
-                .build()
-                .unwrap_or(bare),
-        }
-    });
+    let message = message(passage);
     let mut letter = match &passage.envelope {
         Some(envelope) => letter_to_json(envelope, &fipa::Payload::default()),
         None => json!({}),
@@ -171,19 +186,34 @@ fn contents(passage: &Passage) -> Value {
 }
 
 pub(super) fn overdue(overdue: &Overdue) -> String {
-    line(&json!({
+    line(&overdue_object(overdue))
+}
+
+/// The object of an overdue message.
+pub(in crate::command) fn overdue_object(overdue: &Overdue) -> Value {
+    json!({
         "event": "overdue", "protocol": overdue.protocol,
         "conversation_id": overdue.conversation_id, "participant": overdue.participant,
         "state": overdue.state,
-    }))
+    })
 }
 
 pub(super) fn lost(process: &str, records: u64) -> String {
-    line(&json!({ "event": "lost", "process": process, "records": records }))
+    line(&lost_object(process, records))
+}
+
+/// The object of lost records.
+pub(in crate::command) fn lost_object(process: &str, records: u64) -> Value {
+    json!({ "event": "lost", "process": process, "records": records })
 }
 
 pub(super) fn refused(process: &str, error: &str) -> String {
-    line(&json!({ "event": "refused", "process": process, "error": error }))
+    line(&refused_object(process, error))
+}
+
+/// The object of a process whose data is invalid.
+pub(in crate::command) fn refused_object(process: &str, error: &str) -> Value {
+    json!({ "event": "refused", "process": process, "error": error })
 }
 
 pub(super) fn summary(tally: &Tally) -> String {

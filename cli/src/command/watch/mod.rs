@@ -3,10 +3,9 @@
 pub(super) mod checker;
 mod conversations;
 mod drawing;
-mod filter;
-mod json;
+pub(super) mod filter;
+pub(super) mod json;
 mod mermaid;
-mod recorder;
 mod sequence;
 mod tally;
 pub(super) mod text;
@@ -16,13 +15,12 @@ use std::pin::pin;
 use std::time::{Duration, SystemTime};
 
 use clap::Args;
+use fipa::Config;
 use fipa::admin::watch::{Event, Passage, WatchOptions, Watcher};
-use fipa::{Config, Matcher, Performative};
 
 use self::checker::{CheckResult, Checker, Earlier, Letter};
 use self::conversations::{Conversation, Conversations};
 use self::filter::Filter;
-use self::recorder::Recorder;
 use self::tally::Tally;
 use self::text::{Look, TextOutput};
 use crate::membership::{self, Stop};
@@ -53,7 +51,6 @@ Examples:
   fipa watch --agent 'arm_.*' --protocol fipa-contract-net
   fipa watch --violations --protocols ./protocols
   fipa watch --sequence                          draws conversations as sequence diagrams
-  fipa watch --record letters.rec                 for `fipa protocol replay letters.rec`
   fipa watch --conversation c1 --svg c1.svg      writes a drawing at the end
   fipa watch --conversation c1 --mermaid c1.mmd  writes a diagram for documents at the end
   fipa watch --json | jq -r 'select(.verdict.verdict == \"violation\") | .verdict.text'
@@ -78,25 +75,8 @@ JSON, one object on a line:
   { \"event\": \"summary\", \"seconds\", \"letters\", \"shown\", \"outcomes\", \"conversations\",
     \"violations\", \"lost\" }")]
 pub(crate) struct Arguments {
-    /// Show only letters from or to this agent, or agents matching this pattern; repeatable
-    #[arg(long, value_name = "AGENT", value_parser = Matcher::parse)]
-    agent: Vec<Matcher>,
-
-    /// Show only letters of this protocol, or protocols matching this pattern; repeatable
-    #[arg(long, value_name = "PROTOCOL", value_parser = Matcher::parse)]
-    protocol: Vec<Matcher>,
-
-    /// Show only letters with this performative; repeatable
-    #[arg(long, value_name = "PERFORMATIVE")]
-    performative: Vec<Performative>,
-
-    /// Show only letters of this conversation, or conversations matching this pattern; repeatable
-    #[arg(long, value_name = "ID", value_parser = filter::conversation)]
-    conversation: Vec<filter::Conversation>,
-
-    /// Show only letters that violate their protocols
-    #[arg(long)]
-    violations: bool,
+    #[command(flatten)]
+    filter: Filter,
 
     /// Show content, at most this number of bytes per message
     ///
@@ -125,13 +105,6 @@ pub(crate) struct Arguments {
     /// Write the conversations as a Mermaid sequence diagram to this file at the end
     #[arg(long, value_name = "FILE")]
     mermaid: Option<PathBuf>,
-
-    /// Write all letters with their times to this file, for `fipa protocol replay`
-    ///
-    /// Filters do not apply. The file is replaced; it has no content of messages. The page
-    /// docs/protocols.md describes its format.
-    #[arg(long, value_name = "FILE")]
-    record: Option<PathBuf>,
 
     /// End after this number of shown letters
     #[arg(long, short, value_name = "N")]
@@ -179,23 +152,16 @@ fn bytes(text: &str) -> Result<usize, String> {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    report::warn_of_performatives(&arguments.performative);
+    report::warn_of_performatives(&arguments.filter.performative);
     let directory = arguments.protocols.as_deref();
     let library = checker::protocols(&config.monitor.protocols, directory)?;
     let checker = Checker::new(library);
     // An unwritable file is reported at the start, not at the end.
     arguments.write([].into_iter())?;
-    let recorder = arguments.record.as_deref().map(Recorder::create);
-    let recorder = recorder.transpose()?;
-    options::block_on(watch(&arguments, checker, recorder, &config))?
+    options::block_on(watch(&arguments, checker, &config))?
 }
 
-async fn watch(
-    arguments: &Arguments,
-    checker: Checker,
-    recorder: Option<Recorder>,
-    config: &Config,
-) -> Result<(), Failure> {
+async fn watch(arguments: &Arguments, checker: Checker, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let content = arguments.content.unwrap_or(0);
     let watcher = Watcher::open(config, WatchOptions { content }).await;
@@ -203,16 +169,9 @@ async fn watch(
     let mut earlier = Earlier::default();
     earlier.add(watcher.directory());
     let mut display = Display {
-        filter: Filter {
-            agents: &arguments.agent,
-            protocols: &arguments.protocol,
-            performatives: &arguments.performative,
-            conversations: &arguments.conversation,
-            violations: arguments.violations,
-        },
+        filter: &arguments.filter,
         checker,
         earlier,
-        recorder,
         tally: Tally::default(),
         conversations: (arguments.sequence
             || arguments.mermaid.is_some()
@@ -269,16 +228,15 @@ async fn watch(
 }
 
 /// Interval of checks for overdue messages.
-const TICK: Duration = Duration::from_millis(200);
+pub(super) const TICK: Duration = Duration::from_millis(200);
 /// Maximum delay between sending a letter and observing it. A message is overdue only after it.
-const OBSERVATION_DELAY: Duration = Duration::from_millis(500);
+pub(super) const OBSERVATION_DELAY: Duration = Duration::from_millis(500);
 
 /// Prints the observed events.
 struct Display<'a> {
-    filter: Filter<'a>,
+    filter: &'a Filter,
     checker: Checker,
     earlier: Earlier,
-    recorder: Option<Recorder>,
     tally: Tally,
     conversations: Option<Conversations>,
     format: Format,
@@ -313,9 +271,6 @@ impl Display<'_> {
     fn lose(&mut self, watcher: &Watcher) {
         self.earlier.add(watcher.directory());
         self.checker.forget();
-        if let Some(recorder) = &mut self.recorder {
-            recorder.lose();
-        }
     }
 
     fn event(&mut self, event: &Event) -> Result<(), Failure> {
@@ -362,9 +317,6 @@ impl Display<'_> {
         // Every letter is checked, whether shown or not: the state of a conversation depends on all its
         // letters.
         let letter = Letter::of(passage, &self.earlier);
-        if let Some(recorder) = &mut self.recorder {
-            recorder.add(&letter)?;
-        }
         let checked = self.checker.check(letter);
         self.tally.letter(passage, &checked);
         if !self.filter.takes(passage, &checked) {
@@ -385,14 +337,11 @@ impl Display<'_> {
 
     /// Prints overdue messages and the diagrams of idle conversations.
     fn handle_timeout(&mut self) -> Result<(), Failure> {
-        if let Some(recorder) = &mut self.recorder {
-            recorder.flush()?;
-        }
         let now = SystemTime::now() - OBSERVATION_DELAY;
         for event in self.checker.handle_timeout(now) {
             if self
                 .filter
-                .takes_conversation(event.protocol(), event.conversation())
+                .takes_conversation(Some(&event.protocol), Some(&event.conversation_id))
             {
                 let text = match &self.format {
                     Format::Json => json::overdue(&event),
@@ -417,9 +366,6 @@ impl Display<'_> {
     }
 
     fn end(mut self, arguments: &Arguments) -> Result<(), Failure> {
-        if let Some(recorder) = &mut self.recorder {
-            recorder.flush()?;
-        }
         if let (Format::Sequence(look), Some(conversations)) =
             (&self.format, &mut self.conversations)
         {

@@ -12,6 +12,7 @@ use fipa_transport::{
 use super::super::ids::registration_of;
 use super::super::label::HandedOver;
 use super::super::lane_table::LaneTable;
+use super::super::letter_log::{LetterId, letter_debug};
 use super::super::origin::Settlement;
 use super::super::rules::{self, AttemptEnd, Belief, Cause, CustodyReport};
 use super::super::tally::Tally;
@@ -47,6 +48,8 @@ impl Lane {
         else {
             return;
         };
+        let letter = LetterId::of(self.sender, sequence);
+        letter_debug!(letter, %location, ?conclusion, "attempt ended");
         self.end_transit();
         self.record_event(now, index);
         // The timer visits the letter again, also if its deadline passed in the meantime.

@@ -1,33 +1,18 @@
-//! `fipa protocol replay`: judges the letters of a recording.
+//! `fipa replay --check`: judges the letters of a recording.
 
-use std::fs::File;
-use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use clap::Args;
 use fipa::Time;
-use fipa::monitor::recording::{Reader, Recorded};
 use fipa::monitor::{Library, Machine};
 use serde_json::json;
 
-use crate::command::watch::checker::{CheckResult, Checker, Letter};
+use super::recorded::{self, Contents};
+use crate::command::protocol;
+use crate::command::record::file::letter::RecordedLetter;
+use crate::command::watch::checker::{CheckResult, Checker};
 use crate::options::Global;
+use crate::output;
 use crate::report::{self, Failure};
-use crate::{input, output};
-
-#[derive(Debug, Args)]
-pub(crate) struct Arguments {
-    /// A file of `fipa watch --record`
-    file: PathBuf,
-
-    /// Judge only conversations of this protocol: a name, or an SCXML file; repeatable
-    #[arg(long, value_name = "PROTOCOL")]
-    protocol: Vec<String>,
-
-    /// Print JSON, one object on a line
-    #[arg(long)]
-    json: bool,
-}
 
 /// Numbers of letters.
 #[derive(Default)]
@@ -39,11 +24,17 @@ struct Counts {
     excluded: u64,
 }
 
-pub(crate) fn run(arguments: &Arguments, global: &Global) -> Result<(), Failure> {
-    let mut library = super::library(global)?;
+/// Judges the letters of a file: of all protocols, or of these.
+pub(super) fn run(
+    file: &Path,
+    protocols: &[String],
+    json: bool,
+    global: &Global,
+) -> Result<(), Failure> {
+    let mut library = protocol::library(global)?;
     let mut only = Vec::new();
-    for named in &arguments.protocol {
-        let machine = super::find(named, global)?;
+    for named in protocols {
+        let machine = protocol::find(named, global)?;
         only.push(machine.name().to_owned());
         add(&mut library, machine, named)?;
     }
@@ -61,11 +52,11 @@ pub(crate) fn run(arguments: &Arguments, global: &Global) -> Result<(), Failure>
     let mut replay = Replay {
         checker: Checker::new(library),
         only,
-        json: arguments.json,
+        json,
         counts: Counts::default(),
     };
-    let complete = replay.read(&arguments.file)?;
-    replay.end(complete)?;
+    let contents = recorded::read(file, |letter| replay.letter(&letter))?;
+    replay.end(&contents)?;
     match replay.counts.violations {
         0 => Ok(()),
         _ => Err(Failure::already_reported()),
@@ -91,45 +82,7 @@ struct Replay {
 }
 
 impl Replay {
-    /// Reads and judges a file. Returns whether it was closed.
-    fn read(&mut self, path: &Path) -> Result<bool, Failure> {
-        let failed = |problem: String| {
-            let help = "give a file of `fipa watch --record` that this user can read";
-            Failure::failed(problem, input::name(path), help)
-        };
-        let mut file: Box<dyn Read> = match path == Path::new("-") {
-            true => Box::new(std::io::stdin().lock()),
-            false => {
-                let opened = File::open(path);
-                Box::new(opened.map_err(|error| failed(format!("cannot read: {error}")))?)
-            }
-        };
-        let mut reader = Reader::new();
-        let mut piece = vec![0; 64 * 1024];
-        let mut is_empty = true;
-        loop {
-            let read = match file.read(&mut piece) {
-                Ok(0) => break,
-                Ok(read) => read,
-                Err(error) if error.kind() == std::io::ErrorKind::Interrupted => continue,
-                Err(error) => return Err(failed(format!("cannot read: {error}"))),
-            };
-            is_empty = false;
-            reader.push(piece.get(..read).unwrap_or_default());
-            while let Some(recorded) = reader
-                .next_entry()
-                .map_err(|error| failed(error.to_string()))?
-            {
-                self.letter(&recorded)?;
-            }
-        }
-        match is_empty {
-            true => Err(failed("the input is empty".to_owned())),
-            false => Ok(reader.is_complete()),
-        }
-    }
-
-    fn letter(&mut self, recorded: &Recorded) -> Result<(), Failure> {
+    fn letter(&mut self, recorded: &RecordedLetter) -> Result<(), Failure> {
         self.counts.letters += 1;
         if recorded.after_loss {
             self.checker.forget();
@@ -145,15 +98,7 @@ impl Replay {
         }
         // The time limits of states apply before the letter.
         self.checker.pass(recorded.at);
-        let checked = self.checker.check(Letter {
-            message,
-            receiver: &recorded.receiver,
-            at: recorded.at,
-            answer_within: recorded.answer_within,
-            from_service: recorded.from_service,
-            undelivered: recorded.undelivered,
-            may_continue: recorded.may_continue,
-        });
+        let checked = self.checker.check(recorded.letter());
         match checked {
             CheckResult::Accepted { .. } => self.counts.accepted += 1,
             CheckResult::Unchecked(_) => self.counts.unchecked += 1,
@@ -177,7 +122,7 @@ impl Replay {
         Ok(())
     }
 
-    fn end(&self, complete: bool) -> Result<(), Failure> {
+    fn end(&self, contents: &Contents) -> Result<(), Failure> {
         let Counts {
             letters,
             accepted,
@@ -185,16 +130,16 @@ impl Replay {
             unchecked,
             excluded,
         } = self.counts;
-        if !complete {
+        if contents.is_filtered {
             report::warn(
-                "the recording ends within a letter: the program that wrote it was killed",
+                "letters are left out of this recording by a filter; verdicts may be wrong",
             );
         }
         if self.json {
             return output::json_line(&json!({
                 "event": "summary", "letters": letters, "accepted": accepted,
                 "violations": violations, "unchecked": unchecked, "excluded": excluded,
-                "complete": complete
+                "complete": contents.is_closed
             }));
         }
         output::text(&format!(

@@ -1,0 +1,169 @@
+//! Reads recordings, also those that were not closed.
+//!
+//! A file comes from outside. The records and the chunks of a file, before and after decompression, have a maximum
+//! length, which is checked before memory is taken. The messages of a chunk are read after its checksum is verified.
+
+use std::collections::HashMap;
+use std::io::{self, ErrorKind, Read};
+
+use mcap::McapError;
+use mcap::records::{Channel, MessageHeader, Metadata, SchemaHeader, op};
+use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+
+use super::{RecordingError, fields};
+use crate::report::Failure;
+
+/// Maximum length of a record, and of a chunk before and after decompression, in bytes.
+pub(in crate::command) const MAX_RECORD: usize = 64 << 20;
+/// Maximum length of all channels and schemas of a file, in bytes.
+const MAX_CHANNELS: usize = 16 << 20;
+/// Bytes that are read at once.
+const PIECE: usize = 256 << 10;
+
+/// A schema of a file.
+#[derive(Debug)]
+pub(in crate::command) struct FileSchema {
+    pub(in crate::command) header: SchemaHeader,
+    pub(in crate::command) data: Vec<u8>,
+}
+
+/// A record of a file.
+#[derive(Debug)]
+pub(in crate::command) enum Item<'a> {
+    /// A message.
+    Message {
+        channel: &'a Channel,
+        schema: Option<&'a FileSchema>,
+        header: MessageHeader,
+        data: &'a [u8],
+    },
+    /// A metadata record.
+    Metadata(Metadata),
+}
+
+/// The end of a file.
+#[derive(Debug)]
+pub(in crate::command) struct End {
+    /// Whether the file was closed.
+    pub(in crate::command) is_closed: bool,
+    /// The damage after the last readable record, unless the file just ends.
+    pub(in crate::command) damage: Option<RecordingError>,
+}
+
+/// Reads a file to its last readable record.
+///
+/// # Errors
+/// Fails if the file cannot be read or has another format, or `visit` fails.
+pub(in crate::command) fn read(
+    mut source: impl Read,
+    failed: impl Fn(&RecordingError) -> Failure,
+    mut visit: impl FnMut(Item<'_>) -> Result<(), Failure>,
+) -> Result<End, Failure> {
+    let mut records = LinearReader::new_with_options(
+        LinearReaderOptions::default()
+            .with_skip_end_magic(true)
+            .with_prevalidate_chunk_crcs(true)
+            .with_record_length_limit(MAX_RECORD),
+    );
+    let mut known = Known::default();
+    let mut has_begun = false;
+    let end = |is_closed, damage| End { is_closed, damage };
+    loop {
+        let (opcode, data) = match records.next_event() {
+            Some(Ok(LinearReadEvent::ReadRequest(need))) => {
+                let space = records.insert(need.min(PIECE));
+                let read = read_piece(&mut source, space).map_err(|error| failed(&error.into()))?;
+                records.notify_read(read);
+                continue;
+            }
+            Some(Ok(LinearReadEvent::Record { data, opcode })) => (opcode, data),
+            None | Some(Err(McapError::UnexpectedEof)) if has_begun => return Ok(end(false, None)),
+            None => return Err(failed(&McapError::UnexpectedEof.into())),
+            Some(Err(error)) if has_begun => return Ok(end(false, Some(error.into()))),
+            Some(Err(error)) => return Err(failed(&error.into())),
+        };
+        has_begun = true;
+        if opcode == op::FOOTER {
+            return Ok(end(true, None));
+        }
+        match known.item(opcode, data) {
+            Ok(Some(item)) => visit(item)?,
+            Ok(None) => {}
+            Err(error) => return Ok(end(false, Some(error))),
+        }
+    }
+}
+
+fn read_piece(source: &mut impl Read, space: &mut [u8]) -> io::Result<usize> {
+    loop {
+        match source.read(space) {
+            Err(error) if error.kind() == ErrorKind::Interrupted => {}
+            other => return other,
+        }
+    }
+}
+
+/// The announced schemas and channels.
+#[derive(Debug, Default)]
+struct Known {
+    schemas: HashMap<u16, FileSchema>,
+    channels: HashMap<u16, Channel>,
+    bytes: usize,
+}
+
+impl Known {
+    /// Returns the item of a record, or `None` if it is none.
+    fn item<'a>(
+        &'a mut self,
+        opcode: u8,
+        data: &'a [u8],
+    ) -> Result<Option<Item<'a>>, RecordingError> {
+        let malformed = || RecordingError::Malformed(opcode);
+        match opcode {
+            op::SCHEMA => {
+                let (header, text) = fields::schema(data).ok_or_else(malformed)?;
+                // A repetition has the same data.
+                if !self.schemas.contains_key(&header.id) {
+                    self.count(data.len())?;
+                    let data = text.to_vec();
+                    self.schemas.insert(header.id, FileSchema { header, data });
+                }
+                Ok(None)
+            }
+            op::CHANNEL => {
+                let channel = fields::channel(data).ok_or_else(malformed)?;
+                if !self.channels.contains_key(&channel.id) {
+                    self.count(data.len())?;
+                    self.channels.insert(channel.id, channel);
+                }
+                Ok(None)
+            }
+            op::MESSAGE => {
+                let (header, data) = fields::message(data).ok_or_else(malformed)?;
+                let id = header.channel_id;
+                let channel = self.channels.get(&id);
+                let channel = channel.ok_or(RecordingError::UnknownChannel(id))?;
+                Ok(Some(Item::Message {
+                    channel,
+                    schema: self.schemas.get(&channel.schema_id),
+                    header,
+                    data,
+                }))
+            }
+            op::METADATA => {
+                let metadata = fields::metadata(data).ok_or_else(malformed)?;
+                Ok(Some(Item::Metadata(metadata)))
+            }
+            // Other records are not parsed.
+            _ => Ok(None),
+        }
+    }
+
+    fn count(&mut self, bytes: usize) -> Result<(), RecordingError> {
+        self.bytes = self.bytes.saturating_add(bytes);
+        match self.bytes > MAX_CHANNELS {
+            true => Err(RecordingError::TooManyChannels(MAX_CHANNELS)),
+            false => Ok(()),
+        }
+    }
+}

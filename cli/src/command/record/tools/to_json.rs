@@ -1,0 +1,77 @@
+//! `fipa record to-json`: prints the messages of a recording.
+
+use std::path::PathBuf;
+use std::time::{Duration, UNIX_EPOCH};
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use clap::Args;
+use serde_json::{Value, json};
+
+use super::super::file;
+use super::super::file::reader::Item;
+use super::super::recorder::rfc3339;
+use super::read_file;
+use super::select::{Selection, Selector};
+use crate::output;
+use crate::report::Failure;
+
+/// Print the messages of a recording as JSON, one object on a line
+///
+/// A message that is not JSON is printed in base64. The bytes of letters are printed with --raw only.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa record to-json run.mcap
+  fipa record to-json run.mcap --agent arm_1 | jq .message.letter.message.content
+  fipa record to-json run.mcap --topic /log | jq -r .message.message
+
+JSON, one object on a line:
+  { \"topic\", \"time\": RFC 3339 with milliseconds, \"nanoseconds\": since 1970-01-01T00:00:00Z,
+    \"message\": if it is JSON, or \"base64\" }")]
+pub(in crate::command) struct Arguments {
+    /// Recording; - for standard input
+    file: PathBuf,
+
+    #[command(flatten)]
+    selection: Selection,
+
+    /// Print the bytes of letters, too
+    #[arg(long)]
+    raw: bool,
+}
+
+pub(in crate::command::record) fn run(arguments: &Arguments) -> Result<(), Failure> {
+    let mut selector = Selector::new(&arguments.selection);
+    read_file(&arguments.file, |item| {
+        let is_selected = selector.takes(&item)?;
+        let Item::Message {
+            channel,
+            header,
+            data,
+            ..
+        } = item
+        else {
+            return Ok(());
+        };
+        if !is_selected || (channel.message_encoding == file::LETTER && !arguments.raw) {
+            return Ok(());
+        }
+        let at = UNIX_EPOCH + Duration::from_nanos(header.publish_time);
+        let mut line = json!({
+            "topic": channel.topic, "time": rfc3339(at), "nanoseconds": header.publish_time,
+        });
+        let message = match channel.message_encoding.as_str() {
+            file::JSON => serde_json::from_slice::<Value>(data).ok(),
+            _ => None,
+        };
+        if let Some(object) = line.as_object_mut() {
+            match message {
+                Some(message) => object.insert("message".to_owned(), message),
+                None => object.insert("base64".to_owned(), BASE64.encode(data).into()),
+            };
+        }
+        output::json_line(&line)
+    })?;
+    Ok(())
+}

@@ -1,0 +1,663 @@
+//! `fipa record` and `fipa replay` with real processes.
+
+#![expect(clippy::unwrap_used, reason = "a panic fails the test")]
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use common::{Host, Ran, Running};
+use fastrand::Rng;
+use fipa_testbed::languages::mcap_python;
+use serde_json::{Value, json};
+
+/// Starts `fipa record --json` and waits until it records all running processes.
+fn record(host: &Host, arguments: &[&str]) -> Running {
+    let running = host.start(&[&["record", "--json"], arguments].concat());
+    let ready: Value = serde_json::from_str(&running.ready).unwrap();
+    assert_eq!(ready["event"], "recording");
+    running
+}
+
+/// Ends a recording and returns its summary.
+fn end(mut recording: Running) -> Value {
+    recording.send_signal("-TERM");
+    let summary: Value = serde_json::from_str(&recording.line()).unwrap();
+    assert_eq!(summary["event"], "summary", "{summary}");
+    let (code, errors) = recording.end();
+    assert_eq!((code, errors.as_str()), (Some(0), ""));
+    summary
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+fn send(host: &Host, words: &str) {
+    let ran = host.run(&words.split(' ').collect::<Vec<_>>());
+    assert_eq!(ran.code, Some(0), "{ran:?}");
+}
+
+/// Sends a letter of a conversation to `arm_1`.
+fn say(host: &Host, act: &str, protocol: &str, id: &str, content: &str) {
+    send(
+        host,
+        &format!(
+            "send --from rover --to arm_1 --performative {act} --protocol {protocol} --conversation-id {id} \
+             --in-reply-to x --content {content}"
+        ),
+    );
+}
+
+/// The messages that `fipa record to-json` prints.
+fn messages(host: &Host, file: &Path, options: &[&str]) -> Vec<Value> {
+    let ran = host.run(&[&["record", "to-json", text(file)], options].concat());
+    lines(&ran)
+}
+
+fn lines(ran: &Ran) -> Vec<Value> {
+    let lines = std::str::from_utf8(&ran.stdout).unwrap().lines();
+    lines
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect()
+}
+
+/// The messages of letters among these.
+fn letters(all: &[Value]) -> Vec<&Value> {
+    let of_letter = |it: &&Value| it["message"]["event"] == "letter";
+    all.iter()
+        .filter(of_letter)
+        .map(|it| &it["message"])
+        .collect()
+}
+
+/// Reads a file with the Python package `mcap`. Returns the number of messages by topic; `None` without the package.
+fn read_with_python(test: &str, file: &Path) -> Option<Value> {
+    let program = "
+import collections, json, sys
+from mcap.reader import make_reader
+with open(sys.argv[1], 'rb') as file:
+    counts = collections.Counter()
+    for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+        counts[channel.topic] += 1
+        if channel.message_encoding == 'json':
+            json.loads(message.data)
+            assert schema.encoding == 'jsonschema' and json.loads(schema.data), channel
+print(json.dumps(counts))
+";
+    let python = mcap_python(test)?;
+    let ran = Command::new(python)
+        .args(["-c", program])
+        .arg(file)
+        .output()
+        .unwrap();
+    let errors = String::from_utf8_lossy(&ran.stderr);
+    assert!(ran.status.success(), "{}: {errors}", file.display());
+    Some(serde_json::from_slice(&ran.stdout).unwrap())
+}
+
+/// Records a conversation with a violation, and letters with content of different lengths.
+fn violation(host: &Host) -> PathBuf {
+    let file = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    let recording = record(host, &["-o", text(&file)]);
+    say(host, "cfp", "fipa-contract-net", "c1", "dig");
+    say(host, "inform", "fipa-contract-net", "c1", "dug");
+    let long = host.path("long");
+    fs::write(&long, vec![b'x'; 50_000]).unwrap();
+    send(
+        host,
+        &format!(
+            "send --from rover --to arm_1 --content-file {}",
+            text(&long)
+        ),
+    );
+    let summary = end(recording);
+    assert_eq!(
+        [
+            &summary["letters"],
+            &summary["violations"],
+            &summary["lost"]
+        ],
+        [&json!(3), &json!(1), &json!(0)],
+        "{summary}"
+    );
+    assert_eq!(summary["bytes"], fs::metadata(&file).unwrap().len());
+    file
+}
+
+#[test]
+fn letters_and_a_violation_are_recorded() {
+    let host = Host::new();
+    let file = violation(&host);
+    let all = messages(&host, &file, &["--raw"]);
+    let found = letters(&all);
+    let acts: Vec<&Value> = found.iter().map(|it| &it["performative"]).collect();
+    assert_eq!(acts, ["cfp", "inform", "inform"]);
+    assert_eq!(found[0]["letter"]["message"]["content"], "dig");
+    assert_eq!(found[1]["verdict"]["verdict"], "violation");
+    assert_eq!(
+        (&found[2]["content_length"], &found[2]["content_cut"]),
+        (&json!(50_000), &json!(true))
+    );
+    let of = |topic: &'static str| all.iter().filter(move |it| it["topic"] == topic);
+    // Only the bytes of letters with all their content. They are those of the letters.
+    let raw: Vec<&Value> = of("/letters/arm_1/raw").collect();
+    assert_eq!(raw.len(), 2, "{raw:?}");
+    let bytes = base64::Engine::decode(
+        &base64::engine::general_purpose::STANDARD,
+        raw[0]["base64"].as_str().unwrap(),
+    );
+    let decoded = host.run_with_input(&["decode", "--compact"], &bytes.unwrap());
+    let decoded: Value = serde_json::from_str(&decoded.done()).unwrap();
+    assert_eq!(decoded, found[0]["letter"]);
+    let events: Vec<&Value> = of("/events").map(|it| &it["message"]["event"]).collect();
+    assert!(events.contains(&&json!("violation")), "{events:?}");
+    let here =
+        |it: &Value| it["message"]["agent"]["name"] == "arm_1" && it["message"]["at_start"] == true;
+    assert!(of("/events").any(here), "{all:#?}");
+    // Agents that leave are in the log, too.
+    let mut errors = of("/log").filter(|it| it["message"]["level"] == 4);
+    assert_eq!(errors.next().unwrap()["message"]["name"], "rover");
+    assert!(errors.next().is_none());
+    let info = host
+        .run(&["record", "info", text(&file), "--json"])
+        .done_json();
+    let about = &info[0]["metadata"];
+    assert_eq!(about["fipa.recording"]["domain"], host.domain);
+    assert_eq!(about["fipa.totals"]["letters"], "3");
+    if let Some(read) = read_with_python("letters_and_a_violation_are_recorded", &file) {
+        assert_eq!(read["/letters/arm_1"], 3, "{read}");
+        assert!(read["/log"].as_u64() >= Some(1), "{read}");
+    }
+}
+
+#[test]
+fn a_recording_is_filtered() {
+    let host = Host::new();
+    let file = violation(&host);
+    let filtered = host.path("bad.mcap");
+    let ran = host.run(&[
+        "record",
+        "filter",
+        text(&file),
+        "-o",
+        text(&filtered),
+        "--violations",
+    ]);
+    // The letter and its bytes.
+    assert!(ran.done().starts_with("2 messages"));
+    let all = messages(&host, &filtered, &[]);
+    assert_eq!(letters(&all).len(), 1);
+    assert_eq!(letters(&all)[0]["number"], 2);
+    let checked = host.run(&["replay", text(&filtered), "--check"]);
+    assert!(checked.stderr.contains("left out"), "{}", checked.stderr);
+    let from = all[0]["time"].as_str().unwrap();
+    assert_eq!(messages(&host, &filtered, &["--from", from]).len(), 1);
+    assert_eq!(messages(&host, &filtered, &["--until", from]).len(), 0);
+    let log = messages(&host, &file, &["--topic", "/log"]);
+    assert!(
+        !log.is_empty() && log.iter().all(|it| it["topic"] == "/log"),
+        "{log:#?}"
+    );
+    if let Some(read) = read_with_python("a_recording_is_filtered", &filtered) {
+        assert_eq!(
+            read,
+            json!({ "/letters/arm_1": 1, "/letters/arm_1/raw": 1 })
+        );
+    }
+    // An existing file is kept.
+    let before = fs::read(&filtered).unwrap();
+    let again = host.run(&["record", "-o", text(&filtered)]).failed(1);
+    assert!(again.contains("give another name"), "{again}");
+    assert_eq!(fs::read(&filtered).unwrap(), before);
+}
+
+#[test]
+fn a_killed_recording_is_repaired() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    let mut recording = record(&host, &["-o", text(&file), "--sync", "10ms"]);
+    for number in 0..20 {
+        say(&host, "inform", "none", &format!("c{number}"), "x");
+    }
+    // Until the letters are on the disk.
+    fipa_testbed::until("the letters are in the file", || {
+        letters(&messages(&host, &file, &[])).len() >= 20
+    });
+    recording.send_signal("-KILL");
+    let _ = recording.end();
+    let repaired = host.path("repaired.mcap");
+    let ran = host.run(&["record", "repair", text(&file), "-o", text(&repaired)]);
+    assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+    assert!(ran.stderr.contains("was not closed"), "{}", ran.stderr);
+    let all = messages(&host, &repaired, &[]);
+    let ids: Vec<&str> = letters(&all)
+        .into_iter()
+        .map(|it| it["conversation_id"].as_str().unwrap())
+        .collect();
+    let expected: Vec<String> = (0..20).map(|number| format!("c{number}")).collect();
+    assert_eq!(ids, expected);
+    if let Some(read) = read_with_python("a_killed_recording_is_repaired", &repaired) {
+        assert_eq!(read["/letters/arm_1"], 20, "{read}");
+    }
+}
+
+/// The end of each complete chunk of a file with the number of messages up to it.
+fn chunks(file: &[u8], count: impl Fn(&[u8]) -> usize) -> Vec<(usize, usize)> {
+    let mut ends = Vec::new();
+    let mut at = 8;
+    while let Some(record) = file.get(at..at + 9) {
+        let len = u64::from_le_bytes(record[1..9].try_into().unwrap());
+        at += 9 + usize::try_from(len).unwrap();
+        // The opcode of a chunk.
+        if record[0] == 6 {
+            ends.push((at, count(&file[..at])));
+        }
+    }
+    ends
+}
+
+#[test]
+fn a_cut_file_is_read_to_its_last_complete_chunk() {
+    let host = Host::new();
+    let path = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    // Many small chunks.
+    let recording = record(&host, &["-o", text(&path), "--sync", "1ms"]);
+    send(
+        &host,
+        "send --from rover --to arm_1 --content hello --rate 200 --count 60 --numbered",
+    );
+    end(recording);
+    let file = fs::read(&path).unwrap();
+    let count = |part: &[u8]| {
+        let ran = host.run_with_input(&["record", "to-json", "-", "--raw"], part);
+        assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+        lines(&ran).len()
+    };
+    let ends = chunks(&file, count);
+    assert!(ends.len() > 5, "{}", ends.len());
+    let mut random = Rng::with_seed(7);
+    let mut cut = |file: &[u8]| {
+        let length = random.usize(..file.len());
+        let expected = ends.iter().rev().find(|(end, _)| *end <= length);
+        (length, expected.map_or(0, |(_, messages)| *messages))
+    };
+    let program = host.path("cuts");
+    fs::create_dir(&program).unwrap();
+    // One process reads many files.
+    for round in 0..10 {
+        let cuts: Vec<(usize, usize)> = (0..100).map(|_| cut(&file)).collect();
+        let mut arguments = vec!["record".to_owned(), "info".to_owned(), "--json".to_owned()];
+        let mut expected = Vec::new();
+        for (number, (length, messages)) in cuts.into_iter().enumerate() {
+            // A shorter file has not even the magic number and one record.
+            if length < 200 {
+                continue;
+            }
+            let path = program.join(format!("{round}-{number}"));
+            fs::write(&path, &file[..length]).unwrap();
+            arguments.push(text(&path).to_owned());
+            expected.push((length, messages));
+        }
+        let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+        let ran = host.run(&arguments);
+        assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+        let infos: Value = serde_json::from_slice(&ran.stdout).unwrap();
+        let infos = infos.as_array().unwrap();
+        assert_eq!(infos.len(), expected.len());
+        for (info, (length, messages)) in infos.iter().zip(expected) {
+            assert_eq!(info["messages"], messages, "{length}: {info}");
+        }
+    }
+}
+
+#[test]
+fn hostile_files_are_refused_within_a_limit_of_memory() {
+    let host = Host::new();
+    let path = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    let recording = record(&host, &["-o", text(&path)]);
+    say(&host, "inform", "none", "c1", "x");
+    end(recording);
+    let file = fs::read(&path).unwrap();
+    let mut hostile = Vec::new();
+    // A record of an enormous length behind the magic number, and one behind the header.
+    let header =
+        8 + 9 + usize::try_from(u64::from_le_bytes(file[9..17].try_into().unwrap())).unwrap();
+    for opcode in [1, 3, 4, 5, 6, 9, 12] {
+        let mut record = vec![opcode];
+        record.extend(u64::MAX.to_le_bytes());
+        hostile.push([&file[..8], &record].concat());
+        hostile.push([&file[..header], &record, &file[header..]].concat());
+    }
+    // A chunk that announces a few bytes and unpacks to a gigabyte.
+    hostile.push([&file[..header], &bomb(100, false)].concat());
+    hostile.push([&file[..header], &bomb(1 << 30, true)].concat());
+    // An attachment that is too short.
+    hostile.push([&file[..header], &[9, 1, 0, 0, 0, 0, 0, 0, 0, 0]].concat());
+    let mut random = Rng::with_seed(11);
+    for _ in 0..60 {
+        let mut changed = file.clone();
+        for _ in 0..random.usize(1..8) {
+            let at = random.usize(8..changed.len());
+            changed[at] = random.u8(..);
+        }
+        hostile.push(changed);
+    }
+    for (number, bytes) in hostile.iter().enumerate() {
+        let path = host.path("hostile.mcap");
+        fs::write(&path, bytes).unwrap();
+        for command in [&["record", "to-json", "--raw"][..], &["replay", "--check"]] {
+            let mut limited = Command::new("sh");
+            let fipa = host.command(&[command, &[text(&path)]].concat());
+            // 2 GiB of addresses, of which the threads of the runtime take a part.
+            limited.args(["-c", "ulimit -v 2097152; exec \"$0\" \"$@\""]);
+            limited.arg(fipa.get_program()).args(fipa.get_args());
+            limited
+                .env_clear()
+                .env("HOME", host.path("home"))
+                .current_dir(host.path(""));
+            limited.env("TOKIO_WORKER_THREADS", "2");
+            let ran = limited.output().unwrap();
+            let errors = String::from_utf8_lossy(&ran.stderr);
+            assert!(
+                matches!(ran.status.code(), Some(0 | 1)),
+                "{number}: {:?} {errors}",
+                ran.status
+            );
+            assert!(!errors.contains("panicked"), "{number}: {errors}");
+        }
+    }
+}
+
+/// A chunk of zeros in blocks of zstd, each of which is one byte that is repeated (RFC 8878 3.1.1.2).
+fn bomb(announced: u64, has_checksum: bool) -> Vec<u8> {
+    let mut zstd = vec![0x28, 0xb5, 0x2f, 0xfd, 0x00, 0x58];
+    let blocks = 8 * 1024;
+    for block in 0..blocks {
+        let is_last = u32::from(block + 1 == blocks);
+        let block_header = (128 * 1024) << 3 | 1 << 1 | is_last;
+        zstd.extend(&block_header.to_le_bytes()[..3]);
+        zstd.push(0);
+    }
+    let mut chunk = Vec::new();
+    chunk.extend([0; 16]);
+    chunk.extend(announced.to_le_bytes());
+    chunk.extend(u32::from(has_checksum).to_le_bytes());
+    chunk.extend(4_u32.to_le_bytes());
+    chunk.extend(b"zstd");
+    chunk.extend((zstd.len() as u64).to_le_bytes());
+    chunk.extend(zstd);
+    let mut record = vec![6];
+    record.extend((chunk.len() as u64).to_le_bytes());
+    record.extend(chunk);
+    record
+}
+
+#[test]
+fn a_recording_is_split_and_the_oldest_files_are_deleted() {
+    let host = Host::new();
+    let path = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    let options = [
+        "-o",
+        text(&path),
+        "--sync",
+        "1ms",
+        "--split-size",
+        "4KiB",
+        "--keep",
+        "3",
+    ];
+    let recording = record(&host, &options);
+    send(
+        &host,
+        "send --from rover --to arm_1 --content hello --rate 200 --count 200 --numbered",
+    );
+    let summary = end(recording);
+    let made = summary["files"].as_u64().unwrap();
+    assert!(made > 3, "{summary}");
+    let files = || {
+        let entries = fs::read_dir(path.parent().unwrap()).unwrap();
+        let names = entries.map(|it| it.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<String> = names.filter(|it| it.starts_with("run_")).collect();
+        names.sort_unstable();
+        names
+    };
+    let kept: Vec<String> = (made - 3..made)
+        .map(|it| format!("run_{it:04}.mcap"))
+        .collect();
+    assert_eq!(files(), kept);
+    // Each file is complete, and tells the agents that are there.
+    let mut numbers = Vec::new();
+    for file in &kept {
+        let all = messages(&host, &host.path(file), &[]);
+        assert!(
+            all.iter()
+                .any(|it| it["message"]["agent"]["name"] == "arm_1"),
+            "{all:#?}"
+        );
+        numbers.extend(
+            letters(&all)
+                .into_iter()
+                .map(|it| it["number"].as_u64().unwrap()),
+        );
+        read_with_python(
+            "a_recording_is_split_and_the_oldest_files_are_deleted",
+            &host.path(file),
+        );
+    }
+    let first = numbers[0];
+    assert!(numbers.iter().copied().eq(first..=200), "{numbers:?}");
+    // Another recording continues.
+    end(record(&host, &options));
+    assert_eq!(files().last(), Some(&format!("run_{made:04}.mcap")));
+}
+
+#[test]
+fn a_recording_is_replayed_into_another_domain() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    {
+        let _arm = host.start(&["listen", "arm_1"]);
+        let recording = record(&host, &["-o", text(&file)]);
+        say(&host, "request", "fipa-request", "c1", "lift");
+        say(&host, "inform", "none", "c2", "a");
+        say(&host, "inform", "none", "c2", "b");
+        end(recording);
+    }
+    // It cannot reach the recorded domain by accident.
+    let refused = host
+        .run(&["replay", text(&file), "--into", &host.domain])
+        .failed(2);
+    assert!(refused.contains("--live"), "{refused}");
+    let lab = Host::new();
+    let mut arm = lab.start(&["listen", "arm_1", "--json", "--count", "2"]);
+    let replay = [
+        "replay",
+        text(&file),
+        "--into",
+        &lab.domain,
+        "--only",
+        "arm_1",
+        "--json",
+    ];
+    let replayed = lab
+        .run(&[&replay[..], &["--speed", "4"]].concat())
+        .done_json();
+    assert_eq!(
+        replayed,
+        json!({ "letters": 3, "sent": 2, "failed": 0, "left_out": { "it is a request": 1 } })
+    );
+    let mut conversations = Vec::new();
+    for content in ["a", "b"] {
+        let received: Value = serde_json::from_str(&arm.line()).unwrap();
+        let message = &received["message"];
+        assert_eq!(message["content"], content, "{received:#}");
+        assert_eq!(message["sender"]["name"], "replay/rover");
+        conversations.push(message["conversation_id"].clone());
+    }
+    assert_eq!(conversations[0], conversations[1]);
+    assert_ne!(conversations[0], "c2");
+}
+
+#[test]
+fn recorded_letters_are_judged_later() {
+    let host = Host::new();
+    let (good, bad) = (host.path("good.mcap"), host.path("bad.mcap"));
+    let _arm = host.echo("arm_1");
+    for (file, acts) in [
+        (&good, &["cfp"][..]),
+        (&bad, &["cfp", "inform", "accept-proposal"]),
+    ] {
+        let recording = record(&host, &["-o", text(file)]);
+        for act in acts {
+            say(&host, act, "fipa-contract-net", text(file), "x");
+        }
+        end(recording);
+    }
+    let (good, bad) = (text(&good), text(&bad));
+    let shown = host.run(&["replay", good, "--check"]).done();
+    assert!(
+        shown.starts_with("letters: 1, accepted: 1, violations: 0,"),
+        "{shown}"
+    );
+    let judged = host.run(&["replay", bad, "--check", "--json"]);
+    assert_eq!(judged.code, Some(1));
+    let lines = lines(&judged);
+    let events: Vec<&Value> = lines.iter().map(|line| &line["event"]).collect();
+    assert_eq!(events, ["violation", "violation", "summary"], "{lines:#?}");
+    assert_eq!(
+        (&lines[0]["number"], &lines[1]["number"]),
+        (&json!(2), &json!(3))
+    );
+    assert_eq!(lines[1]["kind"], "out-of-order");
+    assert_eq!(
+        (&lines[2]["letters"], &lines[2]["violations"]),
+        (&json!(3), &json!(2))
+    );
+    assert_eq!(lines[2]["complete"], true);
+    // Only another protocol is judged.
+    let other = ["replay", bad, "--check", "--protocol", "fipa-request"];
+    assert!(host.run(&other).done().contains("violations: 0"));
+    let named = ["replay", bad, "--check", "--protocol", "contractNet"];
+    assert_eq!(host.run(&named).code, Some(1));
+    // A file that is no recording.
+    let no = host.path("no.mcap");
+    fs::write(&no, "<scxml/>").unwrap();
+    let failed = host.run(&["replay", text(&no), "--check"]).failed(1);
+    assert!(failed.contains("no.mcap"), "{failed}");
+}
+
+/// A stopped recorder loses records. The letters after them are not judged by the conversations before.
+#[test]
+fn lost_records_are_in_the_file() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let mut rover = host.ordered_agent("rover", &[]);
+    let _arm = host.ordered_agent("arm_1", &[]);
+    let recording = record(&host, &["-o", text(&file)]);
+    let mut order = |order: Value, answer: &str| {
+        rover.write_line(&order.to_string());
+        while !rover.line().contains(answer) {}
+    };
+    let converse = |act: &str| json!({ "do": "converse", "performative": act, "to": "arm_1", "conversation": "c1" });
+    order(converse("cfp"), "outcomes");
+    let recorded = || messages(&host, &file, &[]);
+    fipa_testbed::until("the first letter is in the file", || {
+        letters(&recorded()).len() == 1
+    });
+    recording.send_signal("-STOP");
+    // More than the queues of the processes hold.
+    order(
+        json!({ "do": "measure", "to": "arm_1", "len": 9, "rounds": 4000 }),
+        "measured",
+    );
+    recording.send_signal("-CONT");
+    let is_lost = |it: &Value| it["message"]["event"] == "lost";
+    fipa_testbed::until("the loss is in the file", || recorded().iter().any(is_lost));
+    // Its answer would be a violation if the conversation were known.
+    order(converse("inform"), "outcomes");
+    fipa_testbed::until("the last letter is in the file", || {
+        let all = recorded();
+        let last = |it: &Value| it["conversation_id"] == "c1" && it["performative"] == "inform";
+        letters(&all).into_iter().any(last)
+    });
+    let summary = end(recording);
+    let lost = summary["lost"].as_u64().unwrap();
+    assert!(lost > 0, "{summary}");
+    let all = messages(&host, &file, &[]);
+    let events = all.iter().filter(|it| it["message"]["event"] == "lost");
+    let in_file: u64 = events
+        .map(|it| it["message"]["records"].as_u64().unwrap())
+        .sum();
+    assert_eq!(in_file, lost);
+    let checked = host.run(&["replay", text(&file), "--check"]).done();
+    assert!(checked.contains("violations: 0"), "{checked}");
+    let info = host
+        .run(&["record", "info", text(&file), "--json"])
+        .done_json();
+    assert_eq!(
+        info[0]["metadata"]["fipa.totals"]["lost_records"],
+        lost.to_string()
+    );
+    let log = all.iter().filter(|it| it["topic"] == "/log");
+    let mut log = log.filter_map(|it| it["message"]["message"].as_str());
+    assert!(log.any(|it| it.ends_with("records of letters were lost")));
+}
+
+#[test]
+fn topics_are_recorded() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let mut command = host.command(&[
+        "publish",
+        "battery",
+        "charge",
+        "-",
+        "--type",
+        "application/json",
+    ]);
+    command.stdin(std::process::Stdio::piped());
+    let mut battery = Running::new(command);
+    let mut recording = host.start(&[
+        "record",
+        "--json",
+        "-o",
+        text(&file),
+        "--topics",
+        "battery/.*",
+    ]);
+    fipa_testbed::until("the recorder has subscribed", || {
+        let topics = host.run(&["topics", "--json"]).done_json();
+        topics[0]["topics"][0]["subscribers"] == 1
+    });
+    for value in 0..50 {
+        battery.write_line(&format!("{{\"percent\": {value}}}"));
+    }
+    fipa_testbed::until("the values are in the file", || {
+        messages(&host, &file, &["--topic", "/topics/battery/charge"]).len() >= 50
+    });
+    recording.send_signal("-INT");
+    let summary: Value = serde_json::from_str(&recording.line()).unwrap();
+    assert_eq!(
+        (&summary["topic_values"], &summary["missed_topic_values"]),
+        (&json!(50), &json!(0)),
+        "{summary}"
+    );
+    assert_eq!(recording.end(), (Some(0), String::new()));
+    let values = messages(&host, &file, &["--topic", "/topics/battery/charge"]);
+    let values: Vec<&Value> = values.iter().map(|it| &it["message"]["percent"]).collect();
+    let expected: Vec<Value> = (0..50).map(Value::from).collect();
+    assert_eq!(values, expected.iter().collect::<Vec<_>>());
+    // They are not recorded as letters, too.
+    assert_eq!(
+        letters(&messages(&host, &file, &["--agent", "fipa-record-.*"])).len(),
+        0
+    );
+}
