@@ -18,6 +18,7 @@ use tracing_subscriber::fmt::format::{self, Format, Json, JsonFields, Writer};
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::registry::LookupSpan;
 
+use crate::log_output::LogOutput;
 use crate::report;
 
 /// Environment variable with the format of the log, for services that are started without options.
@@ -47,7 +48,7 @@ pub(crate) fn start(default_filter: &str, format: Option<LogFormat>) {
     };
     let builder = tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(|| crate::log_output::LogOutput);
+        .with_writer(|| LogOutput);
     match format.unwrap_or_else(format_of_environment) {
         LogFormat::Text => builder
             .with_ansi(std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none())

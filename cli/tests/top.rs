@@ -185,19 +185,19 @@ fn hosts_are_connected_with_their_letters_and_then_lost() {
         !known()["agents"][0].is_null()
     });
     let mut top = host.start(&["top", "--json", "--every", "500ms"]);
+    // The echo agent answers each request.
     let ask = [
         "send",
         "--from",
         "rover",
         "--to",
         &far,
+        "-p",
+        "request",
         "--content",
         "x",
-        "--count",
-        "30",
         "--rate",
         "20",
-        "--wait",
     ];
     let _asking = ChildGuard::start(
         host.command(&ask)

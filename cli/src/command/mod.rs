@@ -68,9 +68,9 @@ pub(crate) enum Command {
     Routes(routes::Arguments),
     Reload(reload::Arguments),
     Watch(Box<watch::Arguments>),
+    Top(top::Arguments),
     Record(Box<record::Arguments>),
     Replay(Box<replay::Arguments>),
-    Top(top::Arguments),
     Demo(demo::Arguments),
     Doctor(doctor::Arguments),
     #[cfg(feature = "bench")]
@@ -112,9 +112,9 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Routes(arguments) => routes::run(arguments, global),
         Command::Reload(arguments) => reload::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
+        Command::Top(arguments) => top::run(arguments, global),
         Command::Record(arguments) => record::run(*arguments, global),
         Command::Replay(arguments) => replay::run(&arguments, global),
-        Command::Top(arguments) => top::run(arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
         Command::Doctor(arguments) => doctor::run(arguments, global),
         #[cfg(feature = "bench")]
