@@ -117,7 +117,9 @@ mod tests {
 
     fn granted(number: u64) -> Act {
         Act::Granted {
-            fence: format!("7.{number}.00000000000000ff@owner#dock").parse().unwrap(),
+            fence: format!("7.{number}.00000000000000ff@owner#dock")
+                .parse()
+                .unwrap(),
             lease: 5000,
             asked: 0,
         }
