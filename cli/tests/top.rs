@@ -106,14 +106,15 @@ fn a_message_that_violates_its_protocol_is_counted() {
     let host = Host::new();
     let _arm = host.echo("arm_1");
     let mut top = host.start(&["top", "--json", "--every", "500ms"]);
-    let agree = [
+    // The echo agent answers no failure.
+    let failure = [
         "send",
         "--from",
         "rover",
         "--to",
         "arm_1",
         "--performative",
-        "agree",
+        "failure",
         "--protocol",
         "fipa-request",
         "--conversation-id",
@@ -121,7 +122,7 @@ fn a_message_that_violates_its_protocol_is_counted() {
         "--content",
         "x",
     ];
-    assert_eq!(host.run(&agree).code, Some(0));
+    assert_eq!(host.run(&failure).code, Some(0));
     let seen = find(&mut top, "a violation", |seen| {
         agent(seen, "rover")["violations"] == 1
     });
