@@ -3,6 +3,7 @@
 use fipa_acl::Message;
 use fipa_mts::core::Received;
 use fipa_sds::Directory;
+use fipa_transport::counts::SharedCounts;
 use fipa_transport::log_limit;
 
 use crate::agent::AgentCore;
@@ -39,7 +40,13 @@ impl Nothing {
         Ok(Self)
     }
 
-    pub(crate) fn checks(&self, _agent: &str, _ids: String, _directory: &dyn Directory) -> Self {
+    pub(crate) fn checks(
+        &self,
+        _agent: &str,
+        _ids: String,
+        _directory: &dyn Directory,
+        _counts: SharedCounts,
+    ) -> Self {
         Self
     }
 

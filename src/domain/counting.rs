@@ -2,11 +2,15 @@
 
 use std::sync::Arc;
 
+#[cfg(feature = "shm")]
 use fipa_acl::ErrorChain;
 #[cfg(feature = "web")]
 use fipa_sds::HostCounts;
 use fipa_sds::{HostDirectory, HostError};
-use fipa_transport::counts::{Counts, SharedCounts, Totals};
+#[cfg(feature = "shm")]
+use fipa_transport::counts::Totals;
+use fipa_transport::counts::{Counts, SharedCounts};
+#[cfg(feature = "shm")]
 use fipa_transport::log_limit;
 #[cfg(feature = "shm")]
 use fipa_transport_shm::CountsPage;
@@ -81,8 +85,10 @@ impl Counting {
     #[cfg(feature = "web")]
     pub(crate) fn totals(&self, host: &HostDirectory) -> Result<HostCounts, HostError> {
         let mut sums = host.sum_counts()?;
-        if let Self::Own(counts) = self {
-            sums.running.add(&counts.totals());
+        match self {
+            #[cfg(feature = "shm")]
+            Self::Shown(_) => {}
+            Self::Own(counts) => sums.running.add(&counts.totals()),
         }
         Ok(sums)
     }
