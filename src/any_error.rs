@@ -28,6 +28,8 @@ use crate::domain::files::DomainDirError;
 #[cfg(feature = "protocols")]
 use crate::error::ProtocolError;
 use crate::error::{OpenError, ReceiveError, SendError};
+#[cfg(feature = "web")]
+use crate::error::{TokenError, WebError};
 #[cfg(feature = "protocols")]
 use crate::locks::{AdmitError, LockError, OwnError, StateFileError};
 #[cfg(feature = "protocols")]
@@ -192,6 +194,14 @@ pub enum Error {
     #[cfg(feature = "secure")]
     #[error(transparent)]
     Keys(#[from] KeysError),
+    /// The HTTP listener of a gateway cannot be opened.
+    #[cfg(feature = "web")]
+    #[error(transparent)]
+    Web(#[from] WebError),
+    /// The token of the HTTP listener cannot be used.
+    #[cfg(feature = "web")]
+    #[error(transparent)]
+    Token(#[from] TokenError),
     /// Two hosts cannot be paired.
     #[cfg(feature = "secure")]
     #[error(transparent)]
