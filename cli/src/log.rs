@@ -3,8 +3,7 @@
 //! Names and texts of peers cannot break a line, and characters that could deceive a reader are escaped, in both
 //! formats.
 
-use std::borrow::Cow;
-use std::fmt::{self, Debug, Write as _};
+use std::fmt::{self, Debug};
 use std::io::IsTerminal;
 
 use anstyle::Style;
@@ -19,7 +18,7 @@ use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::registry::LookupSpan;
 
 use crate::log_output::LogOutput;
-use crate::report;
+use crate::{output, report};
 
 /// Environment variable with the format of the log, for services that are started without options.
 const FORMAT_VARIABLE: &str = "FIPA_LOG_FORMAT";
@@ -114,40 +113,6 @@ where
         let mut line = String::new();
         self.0
             .format_event(context, Writer::new(&mut line), event)?;
-        writeln!(writer, "{}", escaped_json(line.trim_end()))
-    }
-}
-
-/// Returns JSON with its unprintable characters in the escapes of JSON. They can only be in texts.
-fn escaped_json(json: &str) -> Cow<'_, str> {
-    if !json.contains(is_unprintable) {
-        return Cow::Borrowed(json);
-    }
-    let mut out = String::with_capacity(json.len() + 16);
-    for c in json.chars() {
-        if !is_unprintable(c) {
-            out.push(c);
-            continue;
-        }
-        for unit in c.encode_utf16(&mut [0; 2]) {
-            // Writing to a string cannot fail.
-            let _ = write!(out, "\\u{unit:04x}");
-        }
-    }
-    Cow::Owned(out)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn unprintable_characters_are_escaped_in_json() {
-        assert_eq!(escaped_json("{\"a\":\"é→\"}"), "{\"a\":\"é→\"}");
-        let text = "\u{202e}\u{7f}\u{9b}\u{e0001}";
-        let json = serde_json::to_string(text).unwrap();
-        let escaped = escaped_json(&json);
-        assert_eq!(escaped, "\"\\u202e\\u007f\\u009b\\udb40\\udc01\"");
-        assert_eq!(serde_json::from_str::<String>(&escaped).unwrap(), text);
+        writeln!(writer, "{}", output::visible_in_json(line.trim_end()))
     }
 }

@@ -316,7 +316,7 @@ fn ordered_agent(
 /// A stopped watcher does not delay any letter, and reports the lost records later.
 #[test]
 fn a_stopped_watcher_does_not_delay_letters() {
-    const LETTERS: usize = 4000;
+    const LETTERS: usize = 8000;
     let host = Host::new();
     let ((mut rover, mut events), (mut arm, _)) =
         (ordered_agent(&host, "rover"), ordered_agent(&host, "arm"));
