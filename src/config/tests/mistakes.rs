@@ -20,19 +20,19 @@ fn mistakes_are_reported_with_line_and_key() {
         (
             "deadline = \"5s\"\n",
             "fipa.toml:1: unknown key `deadline`; did you mean `mts.deadline`? \
-             (known at the top: domain, runtime_dir, group, mts, transport, discovery, security, contacts, access, monitor, \
-             platform, routes)",
+             (known at the top: domain, runtime_dir, group, mts, transport, discovery, security, http, contacts, access, \
+             monitor, platform, routes)",
         ),
         (
             "[discover]\nmdns = true\n",
             "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
-             (known at the top: domain, runtime_dir, group, mts, transport, discovery, security, contacts, access, monitor, \
-             platform, routes)",
+             (known at the top: domain, runtime_dir, group, mts, transport, discovery, security, http, contacts, access, \
+             monitor, platform, routes)",
         ),
         (
             "[radio]\nrate = 1\n",
             "fipa.toml:1: unknown key `radio`; known at the top: domain, runtime_dir, group, mts, transport, discovery, \
-             security, contacts, access, monitor, platform, routes",
+             security, http, contacts, access, monitor, platform, routes",
         ),
         (
             "[transport.serial]\nlisten = []\n",
@@ -305,6 +305,11 @@ fn mistakes_are_reported_with_line_and_key() {
             "[discovery.static]\necho = [\"http://:7778/acc\"]\n",
             "fipa.toml:2: `discovery.static.echo` lists http://:7778/acc, which has no host or a wrong \
              port; write for example http://10.0.0.7:7778/acc",
+        ),
+        (
+            "[http]\nlisten = \"0.0.0.0:9790\"\n",
+            "fipa.toml:2: `http.listen` is \"0.0.0.0:9790\", which is no address of this host alone; \
+             use 127.0.0.1 or [::1] and a port, for example 127.0.0.1:9790; a proxy or an SSH tunnel serves others",
         ),
         // Files that are not TOML.
         (

@@ -375,6 +375,11 @@ peer_connections = 64                # default
 peer_letters = 20000                 # default
 peer_bytes = "256MiB"                # default
 
+[http]
+listen = ""                          # default
+names = []                           # default
+token_file = ""                      # default
+
 [contacts]
 networks = []                        # default
 
