@@ -156,7 +156,7 @@ fn commands_that_read_say_that_the_input_is_empty_or_noise() {
         (&["content", "check"], 1),
         (&["content", "to-json"], 1),
         (&["content", "from-json"], 1),
-        (&["protocol", "replay", "-"], 1),
+        (&["replay", "-", "--check"], 1),
         (&["protocol", "check", "-"], 1),
     ];
     for (command, code) in commands {

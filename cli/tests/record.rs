@@ -575,7 +575,7 @@ fn lost_records_are_in_the_file() {
     recording.send_signal("-STOP");
     // More than the queues of the processes hold.
     order(
-        json!({ "do": "measure", "to": "arm_1", "len": 9, "rounds": 8000 }),
+        json!({ "do": "measure", "to": "arm_1", "len": 2000, "rounds": 4000 }),
         "measured",
     );
     recording.send_signal("-CONT");

@@ -316,13 +316,15 @@ fn ordered_agent(
 /// A stopped watcher does not delay any letter, and reports the lost records later.
 #[test]
 fn a_stopped_watcher_does_not_delay_letters() {
-    const LETTERS: usize = 8000;
+    const LETTERS: usize = 4000;
     let host = Host::new();
     let ((mut rover, mut events), (mut arm, _)) =
         (ordered_agent(&host, "rover"), ordered_agent(&host, "arm"));
-    let mut watching = watch(&host, &[]);
+    // More than the queues of the processes hold.
+    let mut watching = watch(&host, &["--content=2000"]);
     watching.send_signal("-STOP");
-    let order = format!("{{\"do\":\"measure\",\"to\":\"arm\",\"len\":9,\"rounds\":{LETTERS}}}\n");
+    let order =
+        format!("{{\"do\":\"measure\",\"to\":\"arm\",\"len\":2000,\"rounds\":{LETTERS}}}\n");
     rover
         .stdin
         .as_mut()

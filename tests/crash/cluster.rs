@@ -442,10 +442,12 @@ impl Cluster {
         let kept = SEGMENTS + OPEN_SEGMENTS;
         let most = start.descriptors.iter().map(|count| count + kept);
         let most: Vec<usize> = most.collect();
-        // A gateway leaves its state to its successor.
+        // A gateway leaves its state to its successor, and processes leave the sum of their counters.
         let resource_use = || {
             let mut now = self.resource_use();
-            now.files.retain(|file| !file.ends_with("gateway.state"));
+            let stays =
+                |file: &Path| file.ends_with("gateway.state") || file.ends_with("ended.counts");
+            now.files.retain(|file| !stays(file));
             now
         };
         let mut now = resource_use();

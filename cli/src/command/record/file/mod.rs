@@ -76,7 +76,13 @@ pub(in crate::command) enum RecordingError {
     /// The file cannot be read or written.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// The file is no recording, or a record is malformed.
+    /// The file is empty.
+    #[error("the recording is empty")]
+    Empty,
+    /// The file does not begin as a recording does.
+    #[error("this is no recording in the format MCAP")]
+    NotARecording,
+    /// A record is malformed.
     #[error(transparent)]
     Mcap(#[from] mcap::McapError),
     /// A record is malformed.

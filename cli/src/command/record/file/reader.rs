@@ -66,21 +66,22 @@ pub(in crate::command) fn read(
             .with_record_length_limit(MAX_RECORD),
     );
     let mut known = Known::default();
-    let mut has_begun = false;
+    let (mut has_begun, mut is_empty) = (false, true);
     let end = |is_closed, damage| End { is_closed, damage };
     loop {
         let (opcode, data) = match records.next_event() {
             Some(Ok(LinearReadEvent::ReadRequest(need))) => {
                 let space = records.insert(need.min(PIECE));
                 let read = read_piece(&mut source, space).map_err(|error| failed(&error.into()))?;
+                is_empty &= read == 0;
                 records.notify_read(read);
                 continue;
             }
             Some(Ok(LinearReadEvent::Record { data, opcode })) => (opcode, data),
             None | Some(Err(McapError::UnexpectedEof)) if has_begun => return Ok(end(false, None)),
-            None => return Err(failed(&McapError::UnexpectedEof.into())),
+            None => return Err(failed(&at_beginning(McapError::UnexpectedEof, is_empty))),
             Some(Err(error)) if has_begun => return Ok(end(false, Some(error.into()))),
-            Some(Err(error)) => return Err(failed(&error.into())),
+            Some(Err(error)) => return Err(failed(&at_beginning(error, is_empty))),
         };
         has_begun = true;
         if opcode == op::FOOTER {
@@ -91,6 +92,15 @@ pub(in crate::command) fn read(
             Ok(None) => {}
             Err(error) => return Ok(end(false, Some(error))),
         }
+    }
+}
+
+/// The error of a file in which no record was found.
+fn at_beginning(error: McapError, is_empty: bool) -> RecordingError {
+    match error {
+        _ if is_empty => RecordingError::Empty,
+        McapError::BadMagic | McapError::UnexpectedEof => RecordingError::NotARecording,
+        other => other.into(),
     }
 }
 
