@@ -5,9 +5,10 @@
 use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal, Write};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use comfy_table::{Cell, ContentArrangement, Table, presets};
+use fipa::Time;
 use fipa_acl::{escape, is_unprintable};
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
@@ -241,6 +242,17 @@ fn document(document: serde_json::Result<String>) -> Result<(), Failure> {
         )
     })?;
     text(&format!("{}\n", visible_in_json(&document)))
+}
+
+/// Returns a time in UTC as in RFC 3339. `None` if it is out of the range of that.
+pub(crate) fn rfc3339(time: SystemTime) -> Option<String> {
+    Time::from_system_time(time).ok().and_then(Time::to_rfc3339)
+}
+
+/// Returns the name of this host.
+pub(crate) fn host_name() -> String {
+    let name = rustix::system::uname();
+    name.nodename().to_string_lossy().into_owned()
 }
 
 /// Escapes the unprintable characters that serde_json leaves unescaped. They occur only within

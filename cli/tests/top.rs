@@ -277,15 +277,7 @@ impl OnTerminal {
         let words = std::iter::once(top.get_program()).chain(top.get_args());
         let words: Vec<String> = words.map(|word| quoted(word.to_str().unwrap())).collect();
         let line = format!("exec sh -c {} {}", quoted(&line), words.join(" "));
-        let mut script = Command::new("script");
-        script.args([
-            "--quiet",
-            "--return",
-            "--flush",
-            "--command",
-            &line,
-            "/dev/null",
-        ]);
+        let mut script = fipa_testbed::on_terminal("a test of the screen", &line)?;
         script.env_clear().current_dir(host.path("."));
         for (name, value) in top.get_envs() {
             script.env(name, value.unwrap());
@@ -295,20 +287,12 @@ impl OnTerminal {
         script
             .stdin(Stdio::piped())
             .stdout(fs::File::create(&output).unwrap());
-        match script.spawn() {
-            Ok(script) => Some(Self {
-                script,
-                output,
-                terminal,
-                pid,
-            }),
-            Err(error) => {
-                let in_ci = std::env::var("CI").as_deref() == Ok("true");
-                assert!(!in_ci, "needs `script` of util-linux: {error}");
-                eprintln!("SKIPPED, not a success: needs `script` of util-linux: {error}");
-                None
-            }
-        }
+        Some(Self {
+            script: script.spawn().unwrap(),
+            output,
+            terminal,
+            pid,
+        })
     }
 
     fn output(&self) -> String {

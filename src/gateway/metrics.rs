@@ -23,7 +23,7 @@ const CHECK_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of hosts with values of their own.
 const MAX_HOSTS: usize = 256;
 
-/// What the gateway shows.
+/// The sources of the values.
 pub(super) struct Shown {
     pub(super) service: Arc<Service>,
     pub(super) view: Arc<dyn Directory>,

@@ -1,7 +1,7 @@
 //! The pages in which processes count, and the sum of those that have ended.
 
 use std::fs::File;
-use std::io::{Read as _, Write as _};
+use std::io::Read as _;
 
 use fipa_transport::DomainUsers;
 use fipa_transport::counts::{Counts, Totals};
@@ -41,30 +41,15 @@ impl Guard<'_> {
     }
 
     fn write_counts(&self, name: Name, values: &Totals) -> Result<File, HostError> {
-        let temporary = Name::Temporary(self.id());
         let group_reads = match self.host_dir.users() {
             DomainUsers::This => Mode::empty(),
             DomainUsers::Group(_) => Mode::RGRP,
         };
-        self.host_dir.remove(temporary)?;
-        let mut file = self.host_dir.create(temporary)?;
-        let written = file.write_all(&values.to_page());
         // Another member of a group may not shorten the file: its process would get a signal as it counts.
-        let written = written
-            .and_then(|()| {
-                Ok(rustix::fs::fchmod(
-                    &file,
-                    Mode::RUSR | Mode::WUSR | group_reads,
-                )?)
-            })
-            .map_err(self.host_dir.io("write", temporary));
-        let renamed = written.and_then(|()| self.host_dir.rename(temporary, name));
-        if let Err(error) = renamed {
-            // The first error is returned; the next sweep removes the temporary file.
-            let _ = self.host_dir.remove(temporary);
-            return Err(error);
-        }
-        Ok(file)
+        let mode = Mode::RUSR | Mode::WUSR | group_reads;
+        self.replace(name, &values.to_page(), |file| {
+            Ok(rustix::fs::fchmod(file, mode)?)
+        })
     }
 }
 

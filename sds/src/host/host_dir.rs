@@ -517,7 +517,7 @@ impl HostDir {
         }
     }
 
-    pub(super) fn create(&self, name: Name) -> Result<File, HostError> {
+    fn create(&self, name: Name) -> Result<File, HostError> {
         let file = self.users.create_file(&self.dir, &name.to_string());
         file.map(File::from).map_err(self.io("create", name))
     }
@@ -648,10 +648,7 @@ impl Guard<'_> {
     pub(super) fn write(&self, name: Name, bytes: &[u8]) -> Result<(), HostError> {
         let host_dir = self.host_dir;
         let generation = host_dir.generation()?.wrapping_add(1);
-        let temporary = Name::Temporary(host_dir.id);
-        host_dir.remove(temporary)?;
-        let mut file = host_dir.create(temporary)?;
-        let written = file.write_all(bytes).and_then(|()| {
+        self.replace(name, bytes, |file| {
             // The modification time is the version: clocks are too coarse and inodes are reused, so
             // neither distinguishes two files of one process.
             let version = Timespec {
@@ -666,8 +663,28 @@ impl Guard<'_> {
                 },
                 last_modification: version,
             };
-            rustix::fs::futimens(&file, &times).map_err(io::Error::from)
-        });
+            Ok(rustix::fs::futimens(file, &times)?)
+        })?;
+        let at = RING_START + (SLOT * index_of(generation)) as u64;
+        host_dir
+            .domain
+            .write_all_at(&slot_of(name), at)
+            .and_then(|()| host_dir.domain.write_all_at(&generation.to_le_bytes(), 0))
+            .map_err(host_dir.io("write", Name::Domain))
+    }
+
+    /// Replaces a file as a whole. `finish` is called before the file appears under its name.
+    pub(super) fn replace(
+        &self,
+        name: Name,
+        bytes: &[u8],
+        finish: impl FnOnce(&File) -> io::Result<()>,
+    ) -> Result<File, HostError> {
+        let host_dir = self.host_dir;
+        let temporary = Name::Temporary(host_dir.id);
+        host_dir.remove(temporary)?;
+        let mut file = host_dir.create(temporary)?;
+        let written = file.write_all(bytes).and_then(|()| finish(&file));
         let renamed = written
             .map_err(host_dir.io("write", temporary))
             .and_then(|()| host_dir.rename(temporary, name));
@@ -676,12 +693,7 @@ impl Guard<'_> {
             let _ = host_dir.remove(temporary);
             return Err(error);
         }
-        let at = RING_START + (SLOT * index_of(generation)) as u64;
-        host_dir
-            .domain
-            .write_all_at(&slot_of(name), at)
-            .and_then(|()| host_dir.domain.write_all_at(&generation.to_le_bytes(), 0))
-            .map_err(host_dir.io("write", Name::Domain))
+        Ok(file)
     }
 
     /// Removes the files of dead processes. Returns the number of running processes, including this

@@ -101,6 +101,25 @@ pub fn can_run(name: &str, tools: &[&str], is_permitted: bool) -> bool {
     is_complete(name, &missing)
 }
 
+/// A command that runs a line of the shell on a terminal of its own, of which standard input has the keys and standard
+/// output the text. `None` if the program `script` is missing; then prints a note with the name of the test.
+///
+/// # Panics
+/// If the program is missing and `CI=true`.
+#[must_use]
+pub fn on_terminal(name: &str, line: &str) -> Option<Command> {
+    let mut script = can_run(name, &["script"], true).then(|| Command::new("script"))?;
+    script.args([
+        "--quiet",
+        "--return",
+        "--flush",
+        "--command",
+        line,
+        "/dev/null",
+    ]);
+    Some(script)
+}
+
 /// Whether nothing is missing for a test. If something is, prints a note, or panics if `CI=true`.
 fn is_complete(name: &str, missing: &[&str]) -> bool {
     if missing.is_empty() {

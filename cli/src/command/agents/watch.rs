@@ -5,7 +5,7 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa::{Change, Config, DirectoryView, Entry, Time};
+use fipa::{Change, Config, DirectoryView, Entry};
 use serde_json::json;
 
 use super::{Filter, Reported, Row};
@@ -192,8 +192,7 @@ fn print(
 ) -> Result<(), Failure> {
     // The connections change without a change of the entry.
     let row = Row::of(entry, directory, &Reported::default());
-    let time = Time::from_system_time(SystemTime::now()).ok();
-    let time = time.and_then(Time::to_rfc3339).unwrap_or_default();
+    let time = output::rfc3339(SystemTime::now()).unwrap_or_default();
     if json {
         let line = json!({ "time": time, "change": change.word(), "agent": row.json });
         return output::json_line(&line);

@@ -62,9 +62,8 @@ fn split(arguments: &Arguments) -> Result<Split, Failure> {
 
 /// The metadata of each file.
 fn about(config: &Config) -> BTreeMap<String, String> {
-    let host = rustix::system::uname();
     [
-        ("host", host.nodename().to_string_lossy().into_owned()),
+        ("host", output::host_name()),
         ("domain", config.domain.clone()),
         ("gateway", config.mts.name.clone()),
         ("version", env!("CARGO_PKG_VERSION").to_owned()),

@@ -18,8 +18,8 @@ use super::locks::Grants;
 use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
 use crate::command::watch::filter::Filter;
 use crate::command::watch::{OBSERVATION_DELAY, json};
-use crate::input;
 use crate::report::Failure;
+use crate::{input, output};
 
 /// An observation for the thread that writes.
 pub(super) enum Observation {
@@ -553,8 +553,7 @@ fn finish(mut file: RecordingFile, totals: &Totals) -> Result<u64, RecordingErro
 }
 
 pub(super) fn rfc3339(time: SystemTime) -> String {
-    let time = fipa::Time::from_system_time(time).ok();
-    time.and_then(fipa::Time::to_rfc3339).unwrap_or_default()
+    output::rfc3339(time).unwrap_or_default()
 }
 
 fn nanos(time: SystemTime) -> u64 {

@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use fipa::Time;
 use fipa::monitor::{Library, Machine};
 use serde_json::json;
 
@@ -107,8 +106,7 @@ impl Replay {
                 self.counts.violations += 1;
                 let number = self.counts.letters;
                 let text = violation.to_string();
-                let at = Time::from_system_time(recorded.at).ok();
-                let at = at.and_then(Time::to_rfc3339).unwrap_or_default();
+                let at = output::rfc3339(recorded.at).unwrap_or_default();
                 let kind = violation.kind.as_str();
                 if self.json {
                     return output::json_line(&json!({

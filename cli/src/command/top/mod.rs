@@ -32,6 +32,7 @@ use self::screen::Palette;
 use self::table::{Column, Snapshot, Surroundings};
 use self::terminal::Screen;
 use self::view::{Filter, View};
+use crate::command::watch::OBSERVATION_DELAY;
 use crate::command::watch::checker::{self, Checker, Earlier, Letter};
 use crate::complete;
 use crate::membership::{self, Stop};
@@ -123,8 +124,6 @@ const MIN_INTERVAL: Duration = Duration::from_millis(100);
 const MIN_WINDOW: Duration = Duration::from_secs(5);
 /// Time between two requests to the gateway.
 const REPORT_INTERVAL: Duration = Duration::from_secs(2);
-/// Maximum delay between sending a letter and observing it.
-const OBSERVATION_DELAY: Duration = Duration::from_millis(500);
 
 fn interval(text: &str) -> Result<Duration, String> {
     let time = options::duration(text)?;
@@ -179,7 +178,7 @@ async fn show(
         earlier,
         asker: asker.name().to_owned(),
         domain: config.domain.clone(),
-        host: host_name(),
+        host: output::host_name(),
     };
     let (sender, reports) = mpsc::channel(1);
     let asking = tokio::spawn(ask(asker, sender));
@@ -423,9 +422,4 @@ fn host_of(passage: &Passage, directory: DirectoryView<'_>) -> Option<Arc<str>> 
         Reach::Local => None,
         Reach::Remote { .. } => entry.mts.name.clone(),
     }
-}
-
-fn host_name() -> String {
-    let name = rustix::system::uname();
-    name.nodename().to_string_lossy().into_owned()
 }

@@ -1,8 +1,8 @@
 //! Prints the domain as tables and as JSON.
 
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
-use fipa::{Matcher, Time};
+use fipa::Matcher;
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
 
@@ -74,7 +74,7 @@ pub(super) fn json(snapshot: &Snapshot, order: Order, shown: Option<&Matcher>) -
     } = &snapshot.header;
     let agents = snapshot.sorted(order, shown).into_iter().map(agent);
     json!({
-        "time": rfc3339(surroundings.time), "domain": surroundings.domain, "host": surroundings.host,
+        "time": output::rfc3339(surroundings.time), "domain": surroundings.domain, "host": surroundings.host,
         "agents_here": surroundings.here, "agents_elsewhere": surroundings.elsewhere,
         "processes": surroundings.processes, "gateway": surroundings.gateway,
         "problem": surroundings.problem,
@@ -134,8 +134,4 @@ fn percentile_99(latency: Option<Latency>) -> Option<u64> {
 
 fn micros(time: Duration) -> u64 {
     u64::try_from(time.as_micros()).unwrap_or(u64::MAX)
-}
-
-fn rfc3339(time: SystemTime) -> Option<String> {
-    Time::from_system_time(time).ok().and_then(Time::to_rfc3339)
 }

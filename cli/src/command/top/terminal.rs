@@ -83,9 +83,7 @@ fn read(sender: &mpsc::Sender<Event>, closed: &AtomicBool) {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::print_stderr, reason = "a skipped test says so")]
-
-    use std::process::{Command, Stdio};
+    use std::process::Stdio;
 
     use super::*;
 
@@ -98,23 +96,11 @@ mod tests {
             "exec {} --exact {NAME} --ignored --nocapture",
             program.display()
         );
-        let mut script = Command::new("script");
-        script.args([
-            "--quiet",
-            "--return",
-            "--flush",
-            "--command",
-            &line,
-            "/dev/null",
-        ]);
-        let output = match script.stdin(Stdio::null()).output() {
-            Ok(output) => output,
-            Err(error) => {
-                let in_ci = std::env::var("CI").as_deref() == Ok("true");
-                assert!(!in_ci, "needs `script` of util-linux: {error}");
-                return eprintln!("SKIPPED, not a success: needs `script` of util-linux: {error}");
-            }
+        let name = "a_panic_restores_the_terminal";
+        let Some(mut script) = fipa_testbed::on_terminal(name, &line) else {
+            return;
         };
+        let output = script.stdin(Stdio::null()).output().unwrap();
         let text = String::from_utf8_lossy(&output.stdout);
         assert!(!output.status.success(), "{text}");
         let [entered, left, message] = ["\x1b[?1049h", "\x1b[?1049l", "a fault of the command"]

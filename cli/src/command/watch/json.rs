@@ -1,7 +1,7 @@
 //! Output of `fipa watch` as JSON, one object per line.
 
 use fipa::admin::watch::{Fate, Passage};
-use fipa::{Attempt, Message, MessageBuilder, Outcome, Time};
+use fipa::{Attempt, Message, MessageBuilder, Outcome};
 use fipa_acl::json::{letter_to_json, message_to_json};
 use serde_json::{Map, Value, json};
 
@@ -39,9 +39,7 @@ pub(in crate::command) fn letter_object(
             object.insert(key.to_owned(), value);
         }
     };
-    let time = Time::from_system_time(passage.at)
-        .ok()
-        .and_then(Time::to_rfc3339);
+    let time = output::rfc3339(passage.at);
     put("event", Some("letter".into()));
     put("number", Some(passage.number.into()));
     put("time", time.map(Value::from));

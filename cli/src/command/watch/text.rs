@@ -4,7 +4,7 @@ use std::time::SystemTime;
 
 use anstyle::{AnsiColor, Style};
 use fipa::admin::watch::{Fate, Passage};
-use fipa::{Message, Outcome, Time};
+use fipa::{Message, Outcome};
 use fipa_acl::{escape, escape_name};
 use fipa_content::{Content, Printer, Profile};
 use unicode_width::UnicodeWidthStr;
@@ -312,7 +312,7 @@ fn agents(sender: &str, receiver: &str, width: usize) -> String {
 
 /// The time of day in UTC, in at most this number of columns.
 pub(in crate::command) fn time_of_day(at: SystemTime, width: usize) -> String {
-    let time = Time::from_system_time(at).ok().and_then(Time::to_rfc3339);
+    let time = output::rfc3339(at);
     let time = time
         .as_deref()
         .and_then(|time| time.get(11..))
