@@ -155,23 +155,25 @@ impl Counts {
         self.add(letter_word(direction, via, outcome), 1);
     }
 
-    /// Counts the outcome of a letter of this process, or of one that it forwards, `after` the time since it was
-    /// submitted or taken into custody.
+    /// Counts the outcome of a letter of this process, or of one that it forwards.
     #[inline]
-    pub fn settled(&self, direction: Direction, outcome: &Outcome, after: Duration) {
+    pub fn settled(&self, direction: Direction, outcome: &Outcome) {
         let (via, end) = match outcome {
             Outcome::Delivered { via, .. } => (Some(*via), LetterOutcome::Delivered),
             Outcome::Sent { via, .. } => (Some(*via), LetterOutcome::Unconfirmed),
             Outcome::Failed { .. } => (None, LetterOutcome::Failed),
         };
         self.letter(direction, via, end);
-        if direction == Direction::Sent {
-            let nanos = after.as_secs().saturating_mul(1_000_000_000);
-            let nanos = nanos.saturating_add(after.subsec_nanos().into());
-            let first = DELIVERIES + transport_index(via) * DELIVERY_WORDS;
-            self.add(first + bucket_of(nanos), 1);
-            self.add(first + BUCKETS + 1, nanos);
-        }
+    }
+
+    /// Counts the time from sending a letter to its outcome.
+    #[inline]
+    pub fn took(&self, via: Option<Kind>, time: Duration) {
+        let nanos = time.as_secs().saturating_mul(1_000_000_000);
+        let nanos = nanos.saturating_add(time.subsec_nanos().into());
+        let first = DELIVERIES + transport_index(via) * DELIVERY_WORDS;
+        self.add(first + bucket_of(nanos), 1);
+        self.add(first + BUCKETS + 1, nanos);
     }
 
     /// Counts an event `times` times.
@@ -397,9 +399,9 @@ mod tests {
             via: Kind::Quic,
             attempts: Vec::new(),
         };
-        counts.settled(Direction::Sent, &delivered, Duration::from_micros(3));
-        counts.settled(Direction::Sent, &delivered, Duration::from_secs(100));
-        counts.settled(Direction::Forwarded, &delivered, Duration::from_micros(3));
+        counts.took(delivered.via(), Duration::from_micros(3));
+        counts.took(delivered.via(), Duration::from_secs(100));
+        counts.settled(Direction::Forwarded, &delivered);
         let mut sum = Totals::default();
         sum.add(&counts.totals());
         sum.add(&counts.totals());

@@ -33,11 +33,13 @@ impl LaneTable {
         } = *open_letter;
         if let Settlement::Outcome(outcome) = &settlement {
             let counts = self.counts();
-            let after = now.saturating_duration_since(since);
             match origin {
-                Origin::Local { .. } => counts.settled(Direction::Sent, outcome, after),
+                Origin::Local { .. } => {
+                    counts.settled(Direction::Sent, outcome);
+                    counts.took(outcome.via(), now.saturating_duration_since(since));
+                }
                 Origin::Forwarded { .. } | Origin::LegacyPeer { .. } => {
-                    counts.settled(Direction::Forwarded, outcome, after);
+                    counts.settled(Direction::Forwarded, outcome);
                 }
                 Origin::FailureMessage => counts.event(Event::FailureMessage, 1),
             }

@@ -408,7 +408,8 @@ impl Core {
         let outcome = Outcome::Failed { reason, attempts };
         let counts = self.table.counts();
         counts.event(Event::Submitted, 1);
-        counts.settled(Direction::Sent, &outcome, Duration::ZERO);
+        counts.settled(Direction::Sent, &outcome);
+        counts.took(outcome.via(), Duration::ZERO);
         let sequence = self.sequence_of(sender);
         let stream = Stream::between(sender, Incarnation::UNKNOWN);
         self.table
