@@ -147,6 +147,8 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    #[cfg(feature = "shm")]
+    use crate::{Config, Domain, config::Sources};
 
     const PARENT: &str = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
 
@@ -318,6 +320,31 @@ mod tests {
             received_with(&[(EnvelopeParams::TRACEPARENT, &parent)]),
             span("")
         );
+    }
+
+    #[cfg(feature = "shm")]
+    #[tokio::test]
+    async fn a_loan_has_room_for_the_longest_trace_context() {
+        let mut sources = Sources::default();
+        let domain = format!("domain=loans-in-spans-{}", std::process::id());
+        sources.set = vec![domain, "mts.transports=shm".to_owned()];
+        let config = Config::load(&sources).unwrap();
+        let here = Domain::open(&config).await.unwrap();
+        let there = Domain::open(&config).await.unwrap();
+        let rover = here.register("rover").await.unwrap();
+        let _arm = there.register("arm").await.unwrap();
+        let message = rover.message(Performative::Inform).receiver("arm");
+        let loan = rover.loan(message, 1 << 20).unwrap();
+        let sent = {
+            let span = span(&state_of(MAX_TRACESTATE));
+            let _current = Context::new().with_remote_span_context(span).attach();
+            rover.send_loan(loan)
+        };
+        assert!(sent.await.unwrap().all_succeeded());
+        let counters = here.inner.service.shm_counters();
+        assert_eq!((counters.loans_sent, counters.loans_copied), (1, 0));
+        here.close().await;
+        there.close().await;
     }
 
     proptest! {
