@@ -230,8 +230,11 @@ async fn a_span_of_tracing_is_sent_and_becomes_the_parent_of_another_one() {
     use tracing_opentelemetry::OpenTelemetrySpanExt as _;
 
     let tracing = Tracing::new();
-    let layer = tracing_opentelemetry::layer().with_tracer(tracing.tracer.clone());
+    let tracer = tracing.tracer.clone();
+    // ANCHOR: layer
+    let layer = tracing_opentelemetry::layer().with_tracer(tracer);
     let subscriber = tracing_subscriber::registry().with(layer);
+    // ANCHOR_END: layer
     let _default = tracing::subscriber::set_default(subscriber);
     let domain = Domain::open(&config(&[])).await.unwrap();
     let rover = domain.register("rover").await.unwrap();
@@ -245,11 +248,13 @@ async fn a_span_of_tracing_is_sent_and_becomes_the_parent_of_another_one() {
             .unwrap()
             .all_succeeded()
     );
+    // ANCHOR: handle
     let letter = arm.receive().await.unwrap();
-    let parent = span_of(&drive.context());
-    assert!(parent.is_valid());
     let handle = tracing::info_span!("handle");
     handle.set_parent(letter.trace_context()).unwrap();
+    // ANCHOR_END: handle
+    let parent = span_of(&drive.context());
+    assert!(parent.is_valid());
     drop((handle, drive));
 
     let ended = tracing.ended.get_finished_spans().unwrap();
