@@ -74,8 +74,8 @@ fn with_parameters(letter: &Letter, parameters: Vec<(String, String)>) -> Result
     Ok(Letter::new(encoded, letter.payload().clone()))
 }
 
-/// Returns a context whose span is the remote one in which the letter was sent. Without valid parameters, the context has
-/// no span.
+/// Returns a context whose span is the remote one in which the letter was sent. Without valid parameters, the context
+/// has no span.
 pub(crate) fn of(letter: &Letter) -> Context {
     match span_of(letter) {
         Some(span) => Context::new().with_remote_span_context(span),

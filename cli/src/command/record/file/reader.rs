@@ -103,7 +103,8 @@ pub(in crate::command) fn read(
     }
 }
 
-/// Returns the records of a chunk. The reader of the crate `mcap` does not check that the records of a chunk end with it.
+/// Returns the records of a chunk. The reader of the crate `mcap` does not check that the records of a chunk end with
+/// it.
 fn unpacked(chunk: &[u8]) -> Result<Cow<'_, [u8]>, RecordingError> {
     let (header, stored) = fields::chunk(chunk).ok_or(RecordingError::Malformed(op::CHUNK))?;
     let records = match header.compression.as_str() {
