@@ -117,7 +117,7 @@
 )]
 #![cfg_attr(
     not(feature = "opentelemetry"),
-    doc = "[`protocol::Task::trace_context`]: https://docs.rs/fipa/latest/fipa/protocol/struct.Task.html#method.trace_context"
+    doc = "[`protocol::Task::trace_context`]: https://docs.rs/fipa/latest/fipa/protocol/struct.Task.html"
 )]
 #![cfg_attr(
     not(feature = "net"),
