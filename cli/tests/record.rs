@@ -3,6 +3,9 @@
 #![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
+#[path = "common/mcap_file.rs"]
+#[allow(dead_code, reason = "not all items are used here")]
+mod mcap_file;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,6 +14,7 @@ use std::process::Command;
 use common::{Host, Ran, Running};
 use fastrand::Rng;
 use fipa_testbed::languages::mcap_python;
+use mcap_file::{Compression, rechunked};
 use serde_json::{Value, json};
 
 /// Starts `fipa record --json` and waits until it records all running processes.
@@ -372,6 +376,51 @@ fn hostile_files_are_refused_within_a_limit_of_memory() {
             );
             assert!(!errors.contains("panicked"), "{number}: {errors}");
         }
+    }
+}
+
+#[test]
+fn files_with_changed_records_and_valid_checksums_end_no_command() {
+    let host = Host::new();
+    let path = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    let recording = record(&host, &["-o", text(&path)]);
+    say(&host, "inform", "fipa-request", "c1", "x");
+    say(&host, "request", "none", "c2", "x");
+    end(recording);
+    let file = fs::read(&path).unwrap();
+    let mut random = Rng::with_seed(5);
+    let (changed, copy) = (host.path("changed.mcap"), host.path("copy.mcap"));
+    let (changed, to) = (text(&changed), text(&copy));
+    let commands: [&[&str]; 5] = [
+        &["record", "info", changed],
+        &["record", "to-json", changed, "--agent", "arm_1"],
+        &["record", "repair", changed, "-o", to],
+        &["record", "filter", changed, "-o", to, "--violations"],
+        &["replay", changed, "--check"],
+    ];
+    for number in 0..60 {
+        let bytes = rechunked(&file, Compression::None, |records| {
+            for _ in 0..random.usize(1..6) {
+                let at = random.usize(..records.len());
+                // Digits and quotes are in the lengths, the times and the JSON.
+                let byte = [random.u8(..), b'9', b'"', b'-', 0, 0xff];
+                records[at] = random.choice(byte).unwrap();
+            }
+        });
+        fs::write(changed, &bytes).unwrap();
+        let command = commands[number % commands.len()];
+        let ran = host.run(command);
+        assert!(
+            matches!(ran.code, Some(0 | 1)),
+            "{number} {command:?}: {ran:?}"
+        );
+        assert!(
+            !ran.stderr.contains("panicked"),
+            "{number} {command:?}: {ran:?}"
+        );
+        // A command that reads no record makes no copy.
+        let _ = fs::remove_file(&copy);
     }
 }
 
