@@ -238,6 +238,18 @@ fn requests_without_the_token_or_under_another_name_are_refused() {
     }
     let (status, _) = shown.ask("/other", &shown.admitted());
     assert_eq!(status, 404);
+    // A whole URI in the first line.
+    for (host, expected) in [("evil.example", 421), ("localhost:80", 200)] {
+        let path = format!("http://{host}/metrics");
+        assert_eq!(shown.ask(&path, &shown.admitted()).0, expected, "{host}");
+    }
+    // A client that closes its side after the request.
+    let mut stream = shown.connect();
+    write!(stream, "GET /metrics HTTP/1.1\r\n{}\r\n", shown.admitted()).unwrap();
+    stream.shutdown(std::net::Shutdown::Write).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    assert!(answer.starts_with("HTTP/1.1 200 "), "{answer}");
     let long = format!("{own}{token}X: {}\r\n", "x".repeat(20_000));
     let mut stream = shown.connect();
     // The gateway may close the connection before it has read all.

@@ -41,7 +41,7 @@ pub(super) fn reason_to_leave_out(letter: &RecordedLetter, all: bool) -> Option<
 /// The effect of a message that a replay must not repeat by itself.
 fn effect(message: &Message) -> Option<&'static str> {
     use Performative::{
-        AcceptProposal, Cfp, Propagate, Proxy, Request, RequestWhen, RequestWhenever,
+        AcceptProposal, Cfp, Other, Propagate, Proxy, Request, RequestWhen, RequestWhenever,
     };
     let has_fence = |(name, _): &(String, String)| name.eq_ignore_ascii_case(FENCE);
     if message.user_defined().iter().any(has_fence) {
@@ -54,6 +54,8 @@ fn effect(message: &Message) -> Option<&'static str> {
         Request | RequestWhen | RequestWhenever | Propagate | Proxy => Some("it is a request"),
         Cfp => Some("it is a call for proposals"),
         AcceptProposal => Some("it is an award"),
+        // Agents of the robot may take it for a command.
+        Other(_) => Some("its performative is none of FIPA"),
         _ => None,
     }
 }
@@ -126,6 +128,8 @@ mod tests {
             ("cfp", false),
             ("accept-proposal", false),
             ("proxy", false),
+            ("REQUEST", false),
+            ("go-home", false),
         ] {
             assert_eq!(reason(&said(act), false).is_none(), is_sent, "{act}");
             assert_eq!(reason(&said(act), true), None, "{act}");
