@@ -212,7 +212,39 @@ fn a_recording_is_filtered() {
     let before = fs::read(&filtered).unwrap();
     let again = host.run(&["record", "-o", text(&filtered)]).failed(1);
     assert!(again.contains("give another name"), "{again}");
+    // Standard output takes no recording, and no file gets the name `-`.
+    for command in [&["record"][..], &["record", "repair", text(&file)]] {
+        let refused = host.run(&[command, &["-o", "-"]].concat()).failed(2);
+        assert!(refused.contains("standard output"), "{refused}");
+    }
     assert_eq!(fs::read(&filtered).unwrap(), before);
+}
+
+/// The channel of one agent can have the name of the channel with the bytes of another one.
+#[test]
+fn the_name_of_a_receiver_hides_no_letters() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let _agents = ["arm_1", "arm_1/raw", "raw"].map(|name| host.echo(name));
+    let recording = record(&host, &["-o", text(&file)]);
+    send(&host, "send arm_1 first");
+    send(&host, "send arm_1/raw second");
+    send(&host, "send raw third");
+    // Empty content, whose bytes are recorded, too.
+    host.run(&["send", "raw", ""]).done();
+    end(recording);
+    let all = messages(&host, &file, &["--raw"]);
+    let contents: Vec<&Value> = letters(&all)
+        .iter()
+        .map(|it| &it["letter"]["message"]["content"])
+        .collect();
+    assert_eq!(contents, ["first", "second", "third", ""]);
+    let bytes = all.iter().filter(|it| it["base64"].is_string());
+    assert_eq!(bytes.count(), 4);
+    let checked = host
+        .run(&["replay", text(&file), "--check", "--json"])
+        .done_json();
+    assert_eq!(checked["letters"], 4, "{checked}");
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! Writes the observed events to the files of a recording, in a thread of its own.
 
 use std::collections::{BTreeMap, HashMap};
+use std::io::ErrorKind;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -9,6 +10,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use fipa::Entry;
 use fipa::admin::watch::{Event, Passage};
 use fipa_acl::escape;
+use mcap::McapError;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
@@ -380,17 +382,24 @@ impl Recorder {
     }
 
     fn value(&mut self, value: &TopicValue) -> Result<(), Failure> {
-        let open = self.open()?;
-        open.totals.values += 1;
-        open.totals.missed += value.missed;
-        let sequence = (open.totals.values & u64::from(u32::MAX)) as u32;
-        add(&self.counts.values, 1);
-        add(&self.counts.missed, value.missed);
         let topic = format!("/topics/{}/{}", escape(&value.agent), escape(&value.topic));
         let encoding = match &*value.media_type {
             "application/json" => file::JSON,
             other => other,
         };
+        let open = self.open()?;
+        if !open.file.has_room(&topic, encoding) {
+            // Topics that come and go may have any number of names.
+            let missed = value.missed.saturating_add(1);
+            open.totals.missed += missed;
+            add(&self.counts.missed, missed);
+            return Ok(());
+        }
+        open.totals.values += 1;
+        open.totals.missed += value.missed;
+        let sequence = (open.totals.values & u64::from(u32::MAX)) as u32;
+        add(&self.counts.values, 1);
+        add(&self.counts.missed, value.missed);
         let target = Target {
             topic: &topic,
             encoding,
@@ -563,11 +572,15 @@ fn nanos(time: SystemTime) -> u64 {
 
 /// The error report of a file that cannot be written.
 pub(super) fn failed(error: &RecordingError, path: String) -> Failure {
-    let help = match error {
-        RecordingError::Io(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {
-            "give another name, or remove the file"
+    let cause = match error {
+        RecordingError::Io(error) | RecordingError::Mcap(McapError::Io(error)) => {
+            Some(error.kind())
         }
-        RecordingError::Io(error) if error.kind() == std::io::ErrorKind::StorageFull => {
+        _ => None,
+    };
+    let help = match cause {
+        Some(ErrorKind::AlreadyExists) => "give another name; an existing file is not overwritten",
+        Some(ErrorKind::StorageFull | ErrorKind::QuotaExceeded) => {
             "free space on the disk, or limit the recording with --split-size and --keep"
         }
         _ => "give a file that this user can write, on a disk with free space",

@@ -19,6 +19,8 @@ use super::{RecordingError, Schema};
 const CHUNK: u64 = 1 << 20;
 /// Level of the compression with zstd: the fastest of the positive ones.
 const LEVEL: u32 = 1;
+/// Number of channels from which on values of further topics are not recorded. The format has at most 65,535.
+const MAX_CHANNELS: usize = 4096;
 /// Bytes that are collected before a write.
 const BUFFER: usize = 256 << 10;
 
@@ -42,7 +44,8 @@ pub(in crate::command) struct RecordingFile {
     writer: Writer<BufWriter<Counted>>,
     file: Arc<File>,
     written: Arc<AtomicU64>,
-    channels: HashMap<String, u16>,
+    /// By topic and encoding: names of agents and of topics can make equal topics.
+    channels: HashMap<String, HashMap<String, u16>>,
 }
 
 impl RecordingFile {
@@ -79,8 +82,8 @@ impl RecordingFile {
         stamp: Stamp,
         data: &[u8],
     ) -> Result<(), RecordingError> {
-        let channel_id = match self.channels.get(target.topic) {
-            Some(channel) => *channel,
+        let channel_id = match self.channel(target.topic, target.encoding) {
+            Some(channel) => channel,
             None => self.add_channel(target)?,
         };
         let header = MessageHeader {
@@ -91,6 +94,16 @@ impl RecordingFile {
         };
         self.writer.write_to_known_channel(&header, data)?;
         Ok(())
+    }
+
+    /// Whether a message with this encoding needs no channel beyond [`MAX_CHANNELS`].
+    pub(in crate::command) fn has_room(&self, topic: &str, encoding: &str) -> bool {
+        let channels = || self.channels.values().map(HashMap::len).sum::<usize>();
+        self.channel(topic, encoding).is_some() || channels() < MAX_CHANNELS
+    }
+
+    fn channel(&self, topic: &str, encoding: &str) -> Option<u16> {
+        self.channels.get(topic)?.get(encoding).copied()
     }
 
     fn add_channel(&mut self, target: Target<'_>) -> Result<u16, RecordingError> {
@@ -106,7 +119,8 @@ impl RecordingFile {
             topic, encoding, ..
         } = target;
         let channel = self.writer.add_channel(schema, topic, encoding, &none)?;
-        self.channels.insert(topic.to_owned(), channel);
+        let channels = self.channels.entry(topic.to_owned()).or_default();
+        channels.insert(encoding.to_owned(), channel);
         Ok(channel)
     }
 
