@@ -285,4 +285,15 @@ fn a_wrong_configuration_is_explained() {
         .run(&["up", "--set", listen, "--set", &file])
         .failed_text();
     assert!(error.contains("chmod 600"), "{error}");
+    // No advice to change or delete a device.
+    let file = "http.token_file=/dev/zero";
+    let (_, error) = host
+        .run(&["up", "--set", listen, "--set", file])
+        .failed_text();
+    let is_named = error.contains("regular file") && error.contains("http.token_file");
+    assert!(is_named && !error.contains("delete"), "{error}");
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let listen = format!("http.listen={}", taken.local_addr().unwrap());
+    let (_, error) = host.run(&["up", "--set", &listen]).failed_text();
+    assert!(error.contains("ss -ltnp"), "{error}");
 }

@@ -7,6 +7,7 @@ use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
+use rustix::io::Errno;
 use rustix::process::geteuid;
 use subtle::ConstantTimeEq as _;
 
@@ -41,6 +42,12 @@ pub enum TokenError {
         path: PathBuf,
         /// The error of the operating system.
         source: io::Error,
+    },
+    /// The path is a link, a directory or a device.
+    #[error("{} must be a regular file, and no link", path.display())]
+    NotAFile {
+        /// The path.
+        path: PathBuf,
     },
     /// Other users can read or change the file.
     #[error(
@@ -81,10 +88,21 @@ impl Token {
         }
         let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
         let opened = File::options().read(true).custom_flags(flags).open(path);
-        let file = opened.map_err(io("open"))?;
+        let not_a_file = || TokenError::NotAFile {
+            path: path.to_owned(),
+        };
+        let file = match opened {
+            Err(error) if error.raw_os_error() == Some(Errno::LOOP.raw_os_error()) => {
+                return Err(not_a_file());
+            }
+            opened => opened.map_err(io("open"))?,
+        };
         let found = file.metadata().map_err(io("examine"))?;
+        if !found.is_file() {
+            return Err(not_a_file());
+        }
         let owner = durable::owner_of_new(path).map_err(io("examine"))?;
-        let is_own = found.is_file() && [owner, geteuid().as_raw()].contains(&found.uid());
+        let is_own = [owner, geteuid().as_raw()].contains(&found.uid());
         if !is_own || found.mode() & 0o077 != 0 {
             let path = path.to_owned();
             return Err(TokenError::Open { path });
@@ -219,12 +237,21 @@ mod tests {
         let path = directory.path().join("http.token");
         let other = directory.path().join("other");
         symlink(&other, &path).unwrap();
-        assert!(matches!(Token::load(&path), Err(TokenError::Io { .. })));
+        assert!(matches!(
+            Token::load(&path),
+            Err(TokenError::NotAFile { .. })
+        ));
         assert!(!other.exists(), "a link was followed");
         Token::load(&other).unwrap();
-        assert!(matches!(Token::load(&path), Err(TokenError::Io { .. })));
+        assert!(matches!(
+            Token::load(&path),
+            Err(TokenError::NotAFile { .. })
+        ));
         fs::remove_file(&path).unwrap();
         fs::create_dir(&path).unwrap();
-        assert!(matches!(Token::load(&path), Err(TokenError::Open { .. })));
+        assert!(matches!(
+            Token::load(&path),
+            Err(TokenError::NotAFile { .. })
+        ));
     }
 }
