@@ -446,6 +446,11 @@ fn a_recording_is_split_and_the_oldest_files_are_deleted() {
         "--keep",
         "3",
     ];
+    // Other files with similar names.
+    let others = ["run_20260301.mcap", "run_001.mcap", "run_00001.mcap"];
+    for other in others {
+        fs::write(host.path(other), "").unwrap();
+    }
     let recording = record(&host, &options);
     send(
         &host,
@@ -457,7 +462,8 @@ fn a_recording_is_split_and_the_oldest_files_are_deleted() {
     let files = || {
         let entries = fs::read_dir(path.parent().unwrap()).unwrap();
         let names = entries.map(|it| it.unwrap().file_name().into_string().unwrap());
-        let mut names: Vec<String> = names.filter(|it| it.starts_with("run_")).collect();
+        let is_part = |it: &String| it.starts_with("run_") && !others.contains(&&**it);
+        let mut names: Vec<String> = names.filter(is_part).collect();
         names.sort_unstable();
         names
     };
@@ -489,6 +495,33 @@ fn a_recording_is_split_and_the_oldest_files_are_deleted() {
     // Another recording continues.
     end(record(&host, &options));
     assert_eq!(files().last(), Some(&format!("run_{made:04}.mcap")));
+    for other in others {
+        assert!(host.path(other).exists(), "{other} was deleted");
+    }
+}
+
+#[test]
+fn a_recording_goes_on_after_its_file_is_removed() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    let mut recording = record(&host, &["-o", text(&file), "--sync", "10ms"]);
+    send(&host, "send arm_1 before");
+    fs::remove_file(&file).unwrap();
+    fipa_testbed::until("there is another file", || file.exists());
+    send(&host, "send arm_1 after");
+    recording.send_signal("-TERM");
+    let summary: Value = serde_json::from_str(&recording.line()).unwrap();
+    assert_eq!(summary["files"], 2, "{summary}");
+    let (code, errors) = recording.end();
+    assert_eq!(code, Some(0));
+    assert!(errors.contains("was removed"), "{errors}");
+    let all = messages(&host, &file, &[]);
+    let contents: Vec<&Value> = letters(&all)
+        .iter()
+        .map(|it| &it["letter"]["message"]["content"])
+        .collect();
+    assert_eq!(contents.last().copied(), Some(&json!("after")), "{all:#?}");
 }
 
 #[test]

@@ -20,7 +20,7 @@ use super::locks::Grants;
 use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
 use crate::command::watch::filter::Filter;
 use crate::command::watch::{OBSERVATION_DELAY, json};
-use crate::report::Failure;
+use crate::report::{self, Failure};
 use crate::{input, output};
 
 /// An observation for the thread that writes.
@@ -385,6 +385,8 @@ impl Recorder {
         let topic = format!("/topics/{}/{}", escape(&value.agent), escape(&value.topic));
         let encoding = match &*value.media_type {
             "application/json" => file::JSON,
+            // Messages with this encoding are the bytes of letters.
+            file::LETTER => "",
             other => other,
         };
         let open = self.open()?;
@@ -467,13 +469,23 @@ impl Recorder {
 
     /// Ends chunks and files at their times.
     fn handle_time(&mut self) -> Result<(), Failure> {
+        let sync = self.sync;
         let open = self.open()?;
-        if open.flushed.elapsed() >= self.sync {
+        let mut is_removed = false;
+        if open.flushed.elapsed() >= sync {
+            let removed = open.file.is_removed();
+            is_removed = removed.map_err(|error| failed(&error, input::name(&open.path)))?;
+            if is_removed {
+                let path = input::name(&open.path);
+                report::warn(&format!(
+                    "{path} was removed; the recording goes on in a new file"
+                ));
+            }
             self.flush()?;
         }
         let open = self.open()?;
         let (written, since) = (open.file.written(), open.since);
-        if !self.split.is_full(written, since) {
+        if !is_removed && !self.split.is_full(written, since) {
             return Ok(());
         }
         self.close()?;

@@ -1,8 +1,10 @@
 //! Writes recordings: chunks that are complete on the disk at short intervals, and files that are split.
 
 use std::collections::{BTreeMap, HashMap};
+use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -21,6 +23,8 @@ const CHUNK: u64 = 1 << 20;
 const LEVEL: u32 = 1;
 /// Number of channels from which on values of further topics are not recorded. The format has at most 65,535.
 const MAX_CHANNELS: usize = 4096;
+/// Number of digits of a date such as 20260301. A file with a date in its name is none of a split recording.
+const DATE: usize = 8;
 /// Bytes that are collected before a write.
 const BUFFER: usize = 256 << 10;
 
@@ -151,6 +155,11 @@ impl RecordingFile {
         Ok(Arc::clone(&self.file))
     }
 
+    /// Whether another program has removed the file.
+    pub(in crate::command) fn is_removed(&self) -> Result<bool, RecordingError> {
+        Ok(self.file.metadata()?.nlink() == 0)
+    }
+
     /// Writes the index and synchronizes the file with the disk. Returns the length of the file.
     pub(in crate::command) fn finish(mut self) -> Result<u64, RecordingError> {
         self.writer.finish()?;
@@ -210,9 +219,7 @@ impl Split {
     }
 
     fn parts(&self) -> (String, String) {
-        let text = |part: Option<&std::ffi::OsStr>| {
-            part.unwrap_or_default().to_string_lossy().into_owned()
-        };
+        let text = |part: Option<&OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
         let extension = match self.path.extension() {
             Some(extension) => format!(".{}", extension.to_string_lossy()),
             None => String::new(),
@@ -235,8 +242,12 @@ impl Split {
                 .strip_prefix(&stem)
                 .and_then(|rest| rest.strip_prefix('_'))
                 .and_then(|rest| rest.strip_suffix(&extension))
-                .filter(|digits| digits.len() >= 4 && digits.bytes().all(|it| it.is_ascii_digit()));
-            numbers.extend(number.and_then(|digits| digits.parse::<u64>().ok()));
+                .filter(|digits| {
+                    digits.len() < DATE && digits.bytes().all(|it| it.is_ascii_digit())
+                })
+                .and_then(|digits| digits.parse::<u64>().ok())
+                .filter(|number| self.numbered(*number).file_name() == Some(OsStr::new(&*name)));
+            numbers.extend(number);
         }
         numbers.sort_unstable();
         Ok(numbers)
