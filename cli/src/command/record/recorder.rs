@@ -603,3 +603,20 @@ pub(super) fn failed(error: &RecordingError, path: String) -> Failure {
     );
     Failure::failed(problem, path, help)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_disk_is_explained_also_by_the_format() {
+        let full = || std::io::Error::from(ErrorKind::StorageFull);
+        for error in [
+            RecordingError::Io(full()),
+            RecordingError::Mcap(McapError::Io(full())),
+        ] {
+            let failure = failed(&error, "run.mcap".to_owned());
+            assert!(format!("{failure:?}").contains("--keep"), "{failure:?}");
+        }
+    }
+}
