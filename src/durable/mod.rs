@@ -14,14 +14,14 @@
 pub(crate) mod cuts;
 
 use std::ffi::OsString;
-use std::fs::{self, DirBuilder, File};
+use std::fs::{self, File};
 use std::io::{self, Write as _};
-use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, fchown};
+use std::os::unix::fs::{MetadataExt as _, fchown};
 use std::path::{Path, PathBuf};
 
 #[cfg(test)]
 use cuts::{Step, record};
-use rustix::fs::{Mode, OFlags, RenameFlags, mkdirat, openat, renameat_with};
+use rustix::fs::{Mode, OFlags, openat};
 use rustix::process::geteuid;
 
 /// Replaces a file, or creates it.
@@ -108,6 +108,11 @@ pub(crate) fn lock_file(path: &Path) -> io::Result<File> {
 
 #[cfg(any(feature = "protocols", feature = "secure"))]
 fn create_directory(path: &Path, mode: u32) -> io::Result<()> {
+    use std::fs::DirBuilder;
+    use std::os::unix::fs::DirBuilderExt as _;
+
+    use rustix::fs::{RenameFlags, mkdirat, renameat_with};
+
     let parent = File::open(parent(path).unwrap_or(Path::new("/")))?;
     let (Some(owner), Some(name)) = (Owner::of_new_in(&parent)?, path.file_name()) else {
         return DirBuilder::new().mode(mode).create(path);
@@ -195,6 +200,7 @@ fn or_remove<T>(new: &Path, result: io::Result<T>) -> io::Result<T> {
     result
 }
 
+#[cfg(any(feature = "protocols", feature = "secure"))]
 fn rename_only(from: &Path, to: &Path) -> io::Result<()> {
     fs::rename(from, to)?;
     #[cfg(test)]
