@@ -135,7 +135,7 @@ pub mod blocking;
 pub mod coalitions;
 pub mod config;
 mod domain;
-#[cfg(any(feature = "protocols", feature = "secure"))]
+#[cfg(any(feature = "protocols", feature = "secure", feature = "web"))]
 mod durable;
 pub mod error;
 #[cfg(feature = "fuzzing")]

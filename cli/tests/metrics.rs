@@ -351,6 +351,18 @@ fn requests_without_the_token_or_under_another_name_are_refused() {
     }
     let (status, _) = shown.ask("/other", &shown.admitted());
     assert_eq!(status, 404);
+    // A whole URI in the first line.
+    for (host, expected) in [("evil.example", 421), ("localhost:80", 200)] {
+        let path = format!("http://{host}/metrics");
+        assert_eq!(shown.ask(&path, &shown.admitted()).0, expected, "{host}");
+    }
+    // A client that closes its side after the request.
+    let mut stream = shown.connect();
+    write!(stream, "GET /metrics HTTP/1.1\r\n{}\r\n", shown.admitted()).unwrap();
+    stream.shutdown(std::net::Shutdown::Write).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    assert!(answer.starts_with("HTTP/1.1 200 "), "{answer}");
     let long = format!("{own}{token}X: {}\r\n", "x".repeat(20_000));
     let mut stream = shown.connect();
     // The gateway may close the connection before it has read all.
@@ -386,4 +398,15 @@ fn a_wrong_configuration_is_explained() {
         .run(&["up", "--set", listen, "--set", &file])
         .failed_text();
     assert!(error.contains("chmod 600"), "{error}");
+    // No advice to change or delete a device.
+    let file = "http.token_file=/dev/zero";
+    let (_, error) = host
+        .run(&["up", "--set", listen, "--set", file])
+        .failed_text();
+    let is_named = error.contains("regular file") && error.contains("http.token_file");
+    assert!(is_named && !error.contains("delete"), "{error}");
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let listen = format!("http.listen={}", taken.local_addr().unwrap());
+    let (_, error) = host.run(&["up", "--set", &listen]).failed_text();
+    assert!(error.contains("ss -ltnp"), "{error}");
 }

@@ -216,7 +216,39 @@ fn a_recording_is_filtered() {
     let before = fs::read(&filtered).unwrap();
     let again = host.run(&["record", "-o", text(&filtered)]).failed(1);
     assert!(again.contains("give another name"), "{again}");
+    // Standard output takes no recording, and no file gets the name `-`.
+    for command in [&["record"][..], &["record", "repair", text(&file)]] {
+        let refused = host.run(&[command, &["-o", "-"]].concat()).failed(2);
+        assert!(refused.contains("standard output"), "{refused}");
+    }
     assert_eq!(fs::read(&filtered).unwrap(), before);
+}
+
+/// The channel of one agent can have the name of the channel with the bytes of another one.
+#[test]
+fn the_name_of_a_receiver_hides_no_letters() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let _agents = ["arm_1", "arm_1/raw", "raw"].map(|name| host.echo(name));
+    let recording = record(&host, &["-o", text(&file)]);
+    send(&host, "send arm_1 first");
+    send(&host, "send arm_1/raw second");
+    send(&host, "send raw third");
+    // Empty content, whose bytes are recorded, too.
+    host.run(&["send", "raw", ""]).done();
+    end(recording);
+    let all = messages(&host, &file, &["--raw"]);
+    let contents: Vec<&Value> = letters(&all)
+        .iter()
+        .map(|it| &it["letter"]["message"]["content"])
+        .collect();
+    assert_eq!(contents, ["first", "second", "third", ""]);
+    let bytes = all.iter().filter(|it| it["base64"].is_string());
+    assert_eq!(bytes.count(), 4);
+    let checked = host
+        .run(&["replay", text(&file), "--check", "--json"])
+        .done_json();
+    assert_eq!(checked["letters"], 4, "{checked}");
 }
 
 #[test]
@@ -463,6 +495,11 @@ fn a_recording_is_split_and_the_oldest_files_are_deleted() {
         "--keep",
         "3",
     ];
+    // Other files with similar names.
+    let others = ["run_20260301.mcap", "run_001.mcap", "run_00001.mcap"];
+    for other in others {
+        fs::write(host.path(other), "").unwrap();
+    }
     let recording = record(&host, &options);
     send(
         &host,
@@ -474,7 +511,8 @@ fn a_recording_is_split_and_the_oldest_files_are_deleted() {
     let files = || {
         let entries = fs::read_dir(path.parent().unwrap()).unwrap();
         let names = entries.map(|it| it.unwrap().file_name().into_string().unwrap());
-        let mut names: Vec<String> = names.filter(|it| it.starts_with("run_")).collect();
+        let is_part = |it: &String| it.starts_with("run_") && !others.contains(&&**it);
+        let mut names: Vec<String> = names.filter(is_part).collect();
         names.sort_unstable();
         names
     };
@@ -506,6 +544,33 @@ fn a_recording_is_split_and_the_oldest_files_are_deleted() {
     // Another recording continues.
     end(record(&host, &options));
     assert_eq!(files().last(), Some(&format!("run_{made:04}.mcap")));
+    for other in others {
+        assert!(host.path(other).exists(), "{other} was deleted");
+    }
+}
+
+#[test]
+fn a_recording_goes_on_after_its_file_is_removed() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    let mut recording = record(&host, &["-o", text(&file), "--sync", "10ms"]);
+    send(&host, "send arm_1 before");
+    fs::remove_file(&file).unwrap();
+    fipa_testbed::until("there is another file", || file.exists());
+    send(&host, "send arm_1 after");
+    recording.send_signal("-TERM");
+    let summary: Value = serde_json::from_str(&recording.line()).unwrap();
+    assert_eq!(summary["files"], 2, "{summary}");
+    let (code, errors) = recording.end();
+    assert_eq!(code, Some(0));
+    assert!(errors.contains("was removed"), "{errors}");
+    let all = messages(&host, &file, &[]);
+    let contents: Vec<&Value> = letters(&all)
+        .iter()
+        .map(|it| &it["letter"]["message"]["content"])
+        .collect();
+    assert_eq!(contents.last().copied(), Some(&json!("after")), "{all:#?}");
 }
 
 #[test]

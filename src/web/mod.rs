@@ -27,6 +27,7 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
 
 pub(crate) use self::prometheus::Families;
 pub(crate) use self::token::Token;
@@ -115,7 +116,10 @@ impl Listener {
     pub(crate) async fn serve(self, source: Arc<dyn Source>) {
         let routes = requests::routes(source, self.token, self.names);
         let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+        // Dropped with this future: the connections end with the gateway.
+        let mut connections = JoinSet::new();
         loop {
+            while connections.try_join_next().is_some() {}
             let Ok(place) = Arc::clone(&places).acquire_owned().await else {
                 return;
             };
@@ -128,7 +132,7 @@ impl Listener {
                 }
             };
             let routes = routes.clone();
-            tokio::spawn(async move {
+            connections.spawn(async move {
                 let answered = tokio::time::timeout(CONNECTION_TIMEOUT, answer(stream, routes));
                 match answered.await {
                     Ok(Ok(())) => {}
@@ -148,6 +152,67 @@ async fn answer(stream: TcpStream, routes: axum::Router) -> Result<(), hyper::Er
         .header_read_timeout(HEAD_TIMEOUT)
         .max_buf_size(MAX_HEAD)
         .keep_alive(false)
+        // A client may close its side after the request, as `nc -N` does.
+        .half_close(true)
         .serve_connection(TokioIo::new(stream), TowerToHyperService::new(routes))
         .await
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use tokio::io::AsyncWriteExt as _;
+
+    use super::*;
+
+    /// A source that is never ready, and counts the questions that wait.
+    #[derive(Default)]
+    struct Stuck(AtomicUsize);
+
+    struct Waiting<'a>(&'a AtomicUsize);
+
+    impl Drop for Waiting<'_> {
+        fn drop(&mut self) {
+            self.0.fetch_sub(1, Ordering::Relaxed);
+        }
+    }
+
+    impl Source for Stuck {
+        fn metrics(&self) -> Result<Families, String> {
+            Ok(Families::default())
+        }
+
+        fn readiness(&self) -> Pin<Box<dyn Future<Output = Result<(), String>> + Send + '_>> {
+            self.0.fetch_add(1, Ordering::Relaxed);
+            let waiting = Waiting(&self.0);
+            Box::pin(async move {
+                let _waiting = waiting;
+                std::future::pending().await
+            })
+        }
+    }
+
+    #[tokio::test]
+    async fn connections_end_with_the_listener() {
+        let listener = Listener::open("127.0.0.1:0", &[], Token::for_tests()).unwrap();
+        let address = listener.address();
+        let source = Arc::new(Stuck::default());
+        let serving = tokio::spawn(listener.serve(Arc::clone(&source) as Arc<dyn Source>));
+        let mut client = TcpStream::connect(address).await.unwrap();
+        let request = "GET /readyz HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer 0123456789abcdef\r\n\r\n";
+        client.write_all(request.as_bytes()).await.unwrap();
+        while source.0.load(Ordering::Relaxed) == 0 {
+            tokio::task::yield_now().await;
+        }
+        serving.abort();
+        assert!(serving.await.unwrap_err().is_cancelled());
+        // The runtime has one thread, which drops the task of the connection as soon as this one yields.
+        for _ in 0..10 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(source.0.load(Ordering::Relaxed), 0);
+    }
 }

@@ -9,7 +9,7 @@ use axum::http::header::{
     AUTHORIZATION, CACHE_CONTROL, CONTENT_TYPE, HOST, WWW_AUTHENTICATE, X_CONTENT_TYPE_OPTIONS,
 };
 use axum::http::uri::Authority;
-use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
+use axum::http::{HeaderName, HeaderValue, StatusCode};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
@@ -38,7 +38,7 @@ pub(super) fn routes(source: Arc<dyn Source>, token: Token, names: Vec<String>) 
 }
 
 async fn admit(State(admission): State<Arc<Admission>>, request: Request, next: Next) -> Response {
-    let refused = admission.check(request.headers());
+    let refused = admission.check(&request);
     let mut response = match refused {
         None => next.run(request).await,
         Some(refusal) => refusal,
@@ -52,10 +52,15 @@ async fn admit(State(admission): State<Arc<Admission>>, request: Request, next: 
 
 impl Admission {
     /// Returns the answer to a request that is not admitted.
-    fn check(&self, headers: &HeaderMap) -> Option<Response> {
+    fn check(&self, request: &Request) -> Option<Response> {
+        let headers = request.headers();
+        // A request line with a whole URI names the host, too.
+        let target = request.uri().authority().map(Authority::as_str);
         let mut hosts = headers.get_all(HOST).iter();
         let host = hosts.next().and_then(|host| host.to_str().ok());
-        if hosts.next().is_some() || !host.is_some_and(|host| self.is_own(host)) {
+        let are_own = host.is_some_and(|host| self.is_own(host))
+            && target.is_none_or(|target| self.is_own(target));
+        if hosts.next().is_some() || !are_own {
             let why = "this name is not in http.names of the gateway's configuration\n";
             return Some((StatusCode::MISDIRECTED_REQUEST, why).into_response());
         }
