@@ -11,7 +11,7 @@ use fipa::locks::Fence;
 use fipa::{Message, Performative};
 use fipa_acl::{escape, escape_name};
 use fipa_locking::codec::{is_lock_protocol, read};
-use fipa_locking::{Act, Content, MAX_NAME};
+use fipa_locking::{Act, Content, Conversation, MAX_NAME};
 
 use super::recorder::rfc3339;
 use crate::command::watch::json;
@@ -147,7 +147,7 @@ impl Grants {
         performative: &Performative,
     ) -> Option<LockEvent> {
         let agent = match performative {
-            Performative::Disconfirm => lock.sender,
+            Performative::Disconfirm | Performative::Propagate => lock.sender,
             Performative::Inform | Performative::Refuse => lock.receiver,
             _ => return None,
         };
@@ -162,7 +162,7 @@ impl Grants {
             ..*lock
         };
         match performative {
-            Performative::Disconfirm => return self.release(&lock),
+            Performative::Disconfirm | Performative::Propagate => return self.release(&lock),
             Performative::Refuse => request.state = RequestState::Ended,
             _ if request.state == RequestState::Waiting => {
                 request.state = RequestState::Granted;
@@ -182,13 +182,16 @@ impl Grants {
             Act::Place { .. } if self.request_of(lock.receiver, lock.resource).is_none() => {
                 self.request(lock, lock.receiver);
             }
-            // Its conversation may be that of its sender.
+            // An agent that leaves returns the token in the conversation of its request. A token can have the
+            // conversation of its sender, too.
             Act::Token(_) => {
+                let event = self.release(lock);
                 if let Some(request) = self.request_of(lock.receiver, lock.resource)
                     && request.state == RequestState::Waiting
                 {
                     request.state = RequestState::Token;
                 }
+                return event;
             }
             Act::Confirm { asked: Some(_) } => match self.request_of(lock.sender, lock.resource) {
                 Some(request) if request.state == RequestState::Token => {
@@ -263,6 +266,7 @@ impl Grants {
         }
     }
 
+    /// Handles the end of a request: the release of the lock, or the withdrawal.
     fn release(&mut self, lock: &Lock<'_>) -> Option<LockEvent> {
         let request = self.request_of(lock.sender, lock.resource);
         let request = request.filter(|it| it.conversation == lock.conversation);
@@ -317,15 +321,21 @@ impl Grants {
 
     fn grant(&mut self, lock: &Lock<'_>, fence: Fence) -> Option<LockEvent> {
         let mut since = None;
-        if let Some(request) = self.request_of(lock.receiver, lock.resource)
-            && request.conversation == lock.conversation
-        {
-            match request.state {
-                RequestState::Ended => return None,
-                RequestState::Waiting | RequestState::Token => since = Some(lock.at),
-                RequestState::Granted => {}
+        match self.request_of(lock.receiver, lock.resource) {
+            Some(request) if request.conversation == lock.conversation => {
+                match request.state {
+                    RequestState::Ended => return None,
+                    RequestState::Waiting | RequestState::Token => since = Some(lock.at),
+                    RequestState::Granted => {}
+                }
+                request.state = RequestState::Granted;
             }
-            request.state = RequestState::Granted;
+            Some(request) if is_before(lock.conversation, &request.conversation) => return None,
+            // The request was not observed.
+            _ => {
+                self.request(lock, lock.receiver);
+                self.set(lock, lock.receiver, RequestState::Granted);
+            }
         }
         let before = self.holders.get_mut(lock.resource);
         // An extension has the fence of the grant.
@@ -355,6 +365,11 @@ impl Grants {
             abandoned: None,
         })
     }
+}
+
+/// Whether an agent began a conversation before another one of its conversations.
+fn is_before(conversation: &str, other: &str) -> bool {
+    Conversation::parse(conversation).is_not_after(&Conversation::parse(other))
 }
 
 #[cfg(test)]

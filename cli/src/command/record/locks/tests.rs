@@ -251,7 +251,7 @@ impl Simulation {
                     };
                     let event = self.grants.handle_message(at(self.now), to.name(), &encoded);
                     if let Some(event) = event {
-                        assert_eq!(event.event, "lock_abandoned", "{}", event.text);
+                        assert_eq!(event.event, "lock_abandoned", "{:?}: {}", self.kind, event.text);
                         assert_eq!(event.agent, from.name());
                         assert!(!was_acquired, "{}", event.text);
                         self.abandoned += 1;
