@@ -168,7 +168,7 @@ pub enum Unchecked {
     #[error("the message has no protocol")]
     NoProtocol,
     /// The library has no machine for the protocol.
-    #[error("the library does not have the protocol")]
+    #[error("the protocol has no state machine, so its messages are not checked")]
     UnknownProtocol,
     /// The message has no sender.
     #[error("the message has no sender")]

@@ -249,9 +249,15 @@ impl Simulation {
                         0..8 => without_content(&encoded),
                         _ => encoded,
                     };
-                    let event = self.grants.handle_message(at(self.now), to.name(), &encoded);
+                    let event = self
+                        .grants
+                        .handle_message(at(self.now), to.name(), &encoded);
                     if let Some(event) = event {
-                        assert_eq!(event.event, "lock_abandoned", "{:?}: {}", self.kind, event.text);
+                        assert_eq!(
+                            event.event, "lock_abandoned",
+                            "{:?}: {}",
+                            self.kind, event.text
+                        );
                         assert_eq!(event.agent, from.name());
                         assert!(!was_acquired, "{}", event.text);
                         self.abandoned += 1;
@@ -319,7 +325,7 @@ fn dock() -> Resource {
 fn only_agents_without_the_lock_abandon_it() {
     for kind in Algorithm::ALL {
         let (mut abandoned, mut acquired) = (0, 0);
-        for seed in 0..20 {
+        for seed in 0..10 {
             let mut simulation = Simulation::new(kind, seed);
             for _ in 0..4000 {
                 simulation.step();
@@ -327,9 +333,9 @@ fn only_agents_without_the_lock_abandon_it() {
             abandoned += simulation.abandoned;
             acquired += simulation.acquired;
         }
-        assert!(acquired > 1000, "{kind:?}: {acquired}");
+        assert!(acquired > 500, "{kind:?}: {acquired}");
         if kind == Algorithm::OwnerQueue {
-            assert!(abandoned > 100, "{abandoned}");
+            assert!(abandoned > 50, "{abandoned}");
         }
     }
 }
