@@ -7,8 +7,6 @@ use std::time::SystemTime;
 use fipa::admin::watch::Passage;
 use fipa::{Entry, Reach};
 
-use super::recorder::Directory;
-
 /// Reason for which an agent has left the directory.
 pub(super) const HOST_GONE: &str = "its host is gone";
 
@@ -61,9 +59,13 @@ impl Hosts {
     }
 
     /// Handles the changes of the directory. Returns the hosts that are gone.
-    pub(super) fn handle(&mut self, directory: &Directory) -> Vec<HostGone> {
+    pub(super) fn handle(
+        &mut self,
+        left: &[(Arc<Entry>, &'static str)],
+        appeared: &[Arc<Entry>],
+    ) -> Vec<HostGone> {
         let mut gone: Vec<HostGone> = Vec::new();
-        for (entry, reason) in &directory.left {
+        for (entry, reason) in left {
             let Some(host) = self.agents.remove(&*entry.name) else {
                 continue;
             };
@@ -87,7 +89,7 @@ impl Hosts {
                 }),
             }
         }
-        for entry in &directory.appeared {
+        for entry in appeared {
             self.appear(entry);
         }
         gone

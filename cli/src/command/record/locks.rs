@@ -13,8 +13,8 @@ use fipa_acl::{escape, escape_name};
 use fipa_locking::codec::{is_lock_protocol, read};
 use fipa_locking::{Act, Content, Conversation, MAX_NAME};
 
-use super::recorder::rfc3339;
 use crate::command::watch::json;
+use crate::output;
 
 /// Maximum number of resources whose holders are remembered.
 const MAX_RESOURCES: usize = 10_000;
@@ -292,7 +292,7 @@ impl Grants {
                 let fence = escape(grant.fence.to_string().as_str()).into_owned();
                 match grant.since {
                     Some(since) => {
-                        let since = rfc3339(since);
+                        let since = output::rfc3339(since).unwrap_or_default();
                         format!("{holder} has held it since {since} with fence {fence}")
                     }
                     None => format!("{holder} holds it with fence {fence}"),

@@ -375,7 +375,7 @@ impl Recorder {
 
     fn directory(&mut self, directory: Directory) -> Result<(), Failure> {
         let now = SystemTime::now();
-        for gone in self.hosts.handle(&directory) {
+        for gone in self.hosts.handle(&directory.left, &directory.appeared) {
             let last = gone.last_letter.map(rfc3339);
             let event = json!({
                 "event": "host_gone", "host": *gone.host, "agents": gone.agents, "last_letter": last,

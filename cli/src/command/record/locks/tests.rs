@@ -1,5 +1,3 @@
-#![expect(clippy::unwrap_used, reason = "a panic fails the test")]
-
 use std::collections::VecDeque;
 
 use fastrand::Rng;
@@ -185,7 +183,7 @@ impl Simulation {
         let agent = |number: u64| {
             let me = LockPeer::new(&format!("agent{number}"), number).unwrap();
             Agent {
-                locks: Locks::new(me.clone(), kind, options.clone()),
+                locks: Locks::new(me.clone(), kind, options),
                 me,
                 claim: None,
                 is_acquired: false,

@@ -129,7 +129,7 @@ mod tests {
         found.outcome(1, Some("failed"), Some(later("unreachable").as_bytes()));
         found.outcome(2, Some("delivered"), Some(b"{}"));
         assert_eq!(found.failed(), 2);
-        let mut letter = |number: u64| {
+        let letter = |number: u64| {
             let letter = json!({ "event": "letter", "number": number, "outcome": "under_way" });
             let mut letter = letter.as_object().cloned().unwrap_or_default();
             let is_failed = found.settle(&mut letter);
