@@ -557,6 +557,7 @@ fn recorded_letters_are_judged_later() {
         (&json!(3), &json!(2))
     );
     assert_eq!(lines[2]["complete"], true);
+    assert_eq!(lines[2]["unchecked_reasons"], json!({}));
     // Only another protocol is judged.
     let other = ["replay", bad, "--check", "--protocol", "fipa-request"];
     let other = host.run(&other).done();

@@ -286,12 +286,16 @@ impl fmt::Display for Violation {
         if let Some(ReplyMismatch { expected, received }) = &self.reply {
             write!(f, "; expected {expected:?}, received {received:?}")?;
         }
+        let of_state = match self.kind {
+            ViolationKind::Ended => "it ended in state",
+            _ => "state",
+        };
         match (&self.state, &self.participant) {
             (Some(state), Some(participant)) => {
                 let participant = escape_name(participant);
-                write!(f, "; state {state:?} with {participant}")?;
+                write!(f, "; {of_state} {state:?} with {participant}")?;
             }
-            (Some(state), None) => write!(f, "; state {state:?}")?,
+            (Some(state), None) => write!(f, "; {of_state} {state:?}")?,
             (None, _) => {}
         }
         for (index, expected) in self.expected.iter().enumerate() {
