@@ -287,7 +287,7 @@ impl fmt::Display for Violation {
             write!(f, "; expected {expected:?}, received {received:?}")?;
         }
         let of_state = match self.kind {
-            ViolationKind::Ended => "it ended in state",
+            ViolationKind::Ended => "last state",
             _ => "state",
         };
         match (&self.state, &self.participant) {
