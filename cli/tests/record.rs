@@ -162,16 +162,31 @@ fn letters_and_a_violation_are_recorded() {
     let here =
         |it: &Value| it["message"]["agent"]["name"] == "arm_1" && it["message"]["at_start"] == true;
     assert!(of("/events").any(here), "{all:#?}");
-    // Agents that leave are in the log, too.
-    let mut errors = of("/log").filter(|it| it["message"]["level"] == 4);
-    assert_eq!(errors.next().unwrap()["message"]["name"], "rover");
-    assert!(errors.next().is_none());
+    // Agents that leave are not in the log.
+    let mut log = of("/log").map(|it| &it["message"]);
+    let violation = log.next().unwrap();
+    assert_eq!(
+        (&violation["level"], &violation["name"]),
+        (&json!(4), &json!("rover"))
+    );
+    assert!(log.next().is_none());
     let info = host
         .run(&["record", "info", text(&file), "--json"])
         .done_json();
     let about = &info[0]["metadata"];
     assert_eq!(about["fipa.recording"]["domain"], host.domain);
     assert_eq!(about["fipa.totals"]["letters"], "3");
+    let found = info[0]["found"].as_array().unwrap();
+    assert_eq!(found.len(), 1, "{found:?}");
+    assert_eq!(
+        (&found[0]["kind"], &found[0]["count"]),
+        (&json!("violation"), &json!(1))
+    );
+    let shown = host.run(&["record", "info", text(&file)]).done();
+    assert!(
+        shown.ends_with(&format!("fipa replay {} --check\n", text(&file))),
+        "{shown}"
+    );
     if let Some(read) = read_with_python("letters_and_a_violation_are_recorded", &file) {
         assert_eq!(read["/letters/arm_1"], 3, "{read}");
         assert!(read["/log"].as_u64() >= Some(1), "{read}");
@@ -638,7 +653,7 @@ fn recorded_letters_are_judged_later() {
     let (good, bad) = (text(&good), text(&bad));
     let shown = host.run(&["replay", good, "--check"]).done();
     assert!(
-        shown.starts_with("letters: 1, accepted: 1, violations: 0,"),
+        shown.starts_with("letters: 1, accepted: 1, violations: 0, unchecked: 0,"),
         "{shown}"
     );
     let judged = host.run(&["replay", bad, "--check", "--json"]);
@@ -656,9 +671,15 @@ fn recorded_letters_are_judged_later() {
         (&json!(3), &json!(2))
     );
     assert_eq!(lines[2]["complete"], true);
+    assert_eq!(lines[2]["unchecked_reasons"], json!({}));
     // Only another protocol is judged.
     let other = ["replay", bad, "--check", "--protocol", "fipa-request"];
-    assert!(host.run(&other).done().contains("violations: 0"));
+    let other = host.run(&other).done();
+    assert!(other.contains("violations: 0"), "{other}");
+    assert!(
+        other.ends_with("\n  not judged: 3, of another protocol\n"),
+        "{other}"
+    );
     let named = ["replay", bad, "--check", "--protocol", "contractNet"];
     assert_eq!(host.run(&named).code, Some(1));
     // A file that is no recording.
@@ -723,6 +744,132 @@ fn lost_records_are_in_the_file() {
     let log = all.iter().filter(|it| it["topic"] == "/log");
     let mut log = log.filter_map(|it| it["message"]["message"].as_str());
     assert!(log.any(|it| it.ends_with("records of letters were lost")));
+}
+
+/// One agent holds the lock, one gives up, and one gets it.
+#[test]
+fn an_abandoned_lock_is_in_the_log() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let _crane = host.start(&["own", "bay", "--agent", "crane", "--forget"]);
+    let recording = record(&host, &["-o", text(&file)]);
+    let mut holder = host.start(&[
+        "lock",
+        "bay",
+        "--agent",
+        "rover",
+        "--",
+        "sh",
+        "-c",
+        "echo $FIPA_FENCE; exec sleep 600",
+    ]);
+    let fence = holder.ready.trim().to_owned();
+    let late = [
+        "lock", "bay", "--agent", "loader", "--within", "300ms", "--", "true",
+    ];
+    assert_eq!(host.run(&late).code, Some(124));
+    holder.send_signal("-TERM");
+    let _ = holder.end();
+    send(&host, "lock bay --agent arm -- true");
+    end(recording);
+    let events = messages(&host, &file, &["--topic", "/events"]);
+    let of_locks = |it: &&Value| it["message"].get("resource").is_some();
+    let events: Vec<&Value> = events.iter().filter(of_locks).collect();
+    let [event] = events[..] else {
+        panic!("{events:#?}");
+    };
+    let event = &event["message"];
+    assert_eq!(event["event"], "lock_abandoned", "{event:#}");
+    assert_eq!(
+        [
+            &event["resource"],
+            &event["name"],
+            &event["holder"],
+            &event["fence"]
+        ],
+        ["bay", "loader", "rover", &fence]
+    );
+    assert!(event["seconds"].as_f64().unwrap() > 0.0, "{event:#}");
+    let log = messages(&host, &file, &["--topic", "/log"]);
+    let text = log[0]["message"]["message"].as_str().unwrap();
+    assert!(
+        text.starts_with("loader gave up waiting for bay after "),
+        "{text}"
+    );
+    let since = event["held_since"].as_str().unwrap();
+    let held = format!("; rover has held it since {since} with fence {fence}");
+    assert!(text.ends_with(&held), "{text}");
+}
+
+/// The gateway of another host is killed. Its agents leave together, and letters to them fail.
+#[test]
+fn a_host_that_is_gone_is_one_event() {
+    let (host, other) = (Host::new(), Host::new());
+    let file = host.path("run.mcap");
+    let far = format!("far-{}", other.domain);
+    let _far = other.echo(&far);
+    let crex = other.start(&["up", "--json", "--set", "mts.name=crex"]);
+    let peer = format!(
+        "discovery.static={{ crex = [\"tcp://{}\"] }}",
+        crex.tcp_address()
+    );
+    let _gateway = host.start(&["up", "--set", "mts.name=sherpa", "--set", &peer]);
+    fipa_testbed::until("the far agent is announced", || {
+        let known = host.run(&["agents", &far, "--json"]).done_json();
+        !known["agents"][0].is_null()
+    });
+    let recording = record(&host, &["-o", text(&file)]);
+    let ask = [
+        "send",
+        "--from",
+        "rover",
+        "--to",
+        &far,
+        "-p",
+        "request",
+        "--content",
+        "x",
+    ];
+    assert_eq!(host.run(&[&ask[..], &["--wait"]].concat()).code, Some(0));
+    crex.send_signal("-KILL");
+    let events = || messages(&host, &file, &["--topic", "/events"]);
+    let is_gone = |it: &&Value| it["message"]["event"] == "host_gone";
+    fipa_testbed::until("the host is gone", || {
+        events().iter().any(|it| is_gone(&it))
+    });
+    assert_ne!(host.run(&ask).code, Some(0));
+    end(recording);
+    let events = events();
+    let gone: Vec<&Value> = events.iter().filter(is_gone).collect();
+    assert_eq!(gone.len(), 1, "{gone:#?}");
+    let event = &gone[0]["message"];
+    assert_eq!(event["host"], "crex");
+    let left = events
+        .iter()
+        .filter(|it| it["message"]["reason"] == "its host is gone");
+    assert_eq!(event["agents"], left.count(), "{event:#}");
+    let answer = messages(&host, &file, &["--agent", &far]);
+    let answer = letters(&answer)
+        .into_iter()
+        .rfind(|it| it["sender"] == far.as_str());
+    assert_eq!(event["last_letter"], answer.unwrap()["time"]);
+    let log = messages(&host, &file, &["--topic", "/log"]);
+    let of_host = log.iter().filter(|it| it["message"]["name"] == "crex");
+    assert_eq!(of_host.count(), 1, "{log:#?}");
+    // The letter that was not delivered.
+    let failed = messages(&host, &file, &["--failed"]);
+    let letters = letters(&failed);
+    assert_eq!((failed.len(), letters.len()), (1, 1), "{failed:#?}");
+    assert_eq!(
+        [&letters[0]["receiver"], &letters[0]["outcome"]],
+        [far.as_str(), "failed"]
+    );
+    let info = host
+        .run(&["record", "info", text(&file), "--json"])
+        .done_json();
+    let found = info[0]["found"].as_array().unwrap();
+    let kinds: Vec<&Value> = found.iter().map(|it| &it["kind"]).collect();
+    assert_eq!(kinds, ["letter not delivered", "gone host"]);
 }
 
 #[test]

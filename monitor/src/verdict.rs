@@ -168,7 +168,7 @@ pub enum Unchecked {
     #[error("the message has no protocol")]
     NoProtocol,
     /// The library has no machine for the protocol.
-    #[error("the library does not have the protocol")]
+    #[error("the protocol has no state machine, so its messages are not checked")]
     UnknownProtocol,
     /// The message has no sender.
     #[error("the message has no sender")]
@@ -286,12 +286,16 @@ impl fmt::Display for Violation {
         if let Some(ReplyMismatch { expected, received }) = &self.reply {
             write!(f, "; expected {expected:?}, received {received:?}")?;
         }
+        let of_state = match self.kind {
+            ViolationKind::Ended => "last state",
+            _ => "state",
+        };
         match (&self.state, &self.participant) {
             (Some(state), Some(participant)) => {
                 let participant = escape_name(participant);
-                write!(f, "; state {state:?} with {participant}")?;
+                write!(f, "; {of_state} {state:?} with {participant}")?;
             }
-            (Some(state), None) => write!(f, "; state {state:?}")?,
+            (Some(state), None) => write!(f, "; {of_state} {state:?}")?,
             (None, _) => {}
         }
         for (index, expected) in self.expected.iter().enumerate() {

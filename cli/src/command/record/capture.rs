@@ -16,6 +16,7 @@ use tokio::time::MissedTickBehavior;
 
 use super::Arguments;
 use super::file::writer::Split;
+use super::hosts::HOST_GONE;
 use super::recorder::{Counts, Directory, Observation, Recorder, Settings};
 use super::topics::Topics;
 use crate::command::watch::TICK;
@@ -247,7 +248,7 @@ impl Known {
         let is_new = |entry: &&Arc<Entry>| before.get(&*entry.name) != Some(&entry.incarnation);
         let is_gone = |entry: &&Arc<Entry>| now.get(&*entry.name) != Some(&entry.incarnation);
         let reason = |entry: &Arc<Entry>| match directory.lost_agent(&entry.name) {
-            Some(_) => "its host is gone",
+            Some(_) => HOST_GONE,
             None => "it ended or was deregistered",
         };
         let left = self.entries.iter().filter(is_gone);

@@ -2,6 +2,7 @@
 
 mod capture;
 pub(super) mod file;
+mod hosts;
 mod locks;
 mod recorder;
 pub(super) mod tools;
@@ -46,8 +47,10 @@ Examples:
 The channels of a file:
   /letters/RECEIVER       letters as `fipa watch --json` prints them; /letters after 256 receivers
   /letters/RECEIVER/raw   their bytes for `fipa decode`, if the whole content was recorded
-  /events                 agents that appear and leave, later outcomes, violations, lost records
-  /log                    violations, lost records, lost and refused locks as foxglove.Log
+  /events                 agents that appear and leave, hosts that are gone, later outcomes, violations,
+                          locks, lost records
+  /log                    violations, lost records, hosts that are gone, lost, refused and abandoned locks
+                          as foxglove.Log
   /topics/AGENT/TOPIC     values of topics
 
 JSON, one object on a line:

@@ -16,7 +16,8 @@ use tokio::sync::mpsc;
 
 use super::file::writer::{RecordingFile, Split, Stamp, Syncer, Target};
 use super::file::{self, RecordingError, letter};
-use super::locks::Grants;
+use super::hosts::Hosts;
+use super::locks::{Grants, LockEvent};
 use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
 use crate::command::watch::filter::Filter;
 use crate::command::watch::{OBSERVATION_DELAY, json};
@@ -92,6 +93,7 @@ pub(super) struct Recorder {
     checker: Checker,
     earlier: Earlier,
     grants: Grants,
+    hosts: Hosts,
     directory: Arc<[Arc<Entry>]>,
     counts: Arc<Counts>,
     syncer: Syncer,
@@ -162,6 +164,7 @@ impl Recorder {
             checker: settings.checker,
             earlier: Earlier::default(),
             grants: Grants::default(),
+            hosts: Hosts::new(&directory.entries),
             directory: directory.entries,
             counts,
             syncer,
@@ -270,6 +273,8 @@ impl Recorder {
         // Every letter is checked, whether recorded or not: the state of a conversation depends on all its letters.
         let observed = Letter::of(passage, &self.earlier);
         let checked = self.checker.check(Letter::of(passage, &self.earlier));
+        let lock = self.grants.handle(passage);
+        self.hosts.letter(passage);
         if !self.filter.takes(passage, &checked) || self.is_own(passage) {
             return Ok(());
         }
@@ -304,7 +309,8 @@ impl Recorder {
             };
             self.write(target, stamp, &bytes)?;
         }
-        self.report(passage, &checked)
+        self.report(passage, &checked)?;
+        lock.map_or(Ok(()), |lock| self.lock(passage, &lock))
     }
 
     /// Writes the events and the log of a letter.
@@ -323,15 +329,25 @@ impl Recorder {
             self.event(passage.at, &event)?;
             self.log(passage.at, Level::Error, sender, &text)?;
         }
-        if let Some(lock) = self.grants.handle(passage) {
-            let event = json!({
-                "event": lock.event, "number": passage.number, "resource": lock.resource,
-                "name": lock.agent, "text": lock.text,
-            });
-            self.event(passage.at, &event)?;
-            self.log(passage.at, Level::Warning, &lock.agent, &lock.text)?;
-        }
         Ok(())
+    }
+
+    /// Writes the event and the log of a lock.
+    fn lock(&mut self, passage: &Passage, lock: &LockEvent) -> Result<(), Failure> {
+        let mut event = json!({
+            "event": lock.event, "number": passage.number, "resource": lock.resource,
+            "name": lock.agent, "text": lock.text,
+        });
+        if let (Some(event), Some(abandoned)) = (event.as_object_mut(), &lock.abandoned) {
+            let seconds = (abandoned.waited.as_secs_f64() * 1e3).round() / 1e3;
+            event.insert("seconds".to_owned(), seconds.into());
+            event.insert("holder".to_owned(), abandoned.holder.as_deref().into());
+            let since = abandoned.held_since.map(rfc3339);
+            event.insert("held_since".to_owned(), since.into());
+            event.insert("fence".to_owned(), abandoned.fence.as_deref().into());
+        }
+        self.event(passage.at, &event)?;
+        self.log(passage.at, Level::Warning, &lock.agent, &lock.text)
     }
 
     fn later(&mut self, passage: &Passage) -> Result<(), Failure> {
@@ -360,19 +376,31 @@ impl Recorder {
     }
 
     fn directory(&mut self, directory: Directory) -> Result<(), Failure> {
-        self.directory = directory.entries;
         let now = SystemTime::now();
+        for gone in self.hosts.handle(&directory.left, &directory.appeared) {
+            let last = gone.last_letter.map(rfc3339);
+            let event = json!({
+                "event": "host_gone", "host": *gone.host, "agents": gone.agents, "last_letter": last,
+            });
+            self.event(now, &event)?;
+            let agents = match gone.agents {
+                1 => "1 agent".to_owned(),
+                agents => format!("{agents} agents"),
+            };
+            let last = match last {
+                Some(last) => format!("the last letter from it is of {last}"),
+                None => "no letter from it was observed".to_owned(),
+            };
+            let text = format!("the host is gone, with {agents}; {last}");
+            self.log(now, Level::Warning, &gone.host, &text)?;
+        }
+        self.directory = directory.entries;
         for (entry, reason) in directory.left {
             let name = &*entry.name;
             let event =
                 json!({ "event": "agent_left", "name": name, "reason": reason, "agent": *entry });
             self.event(now, &event)?;
-            self.log(
-                now,
-                Level::Info,
-                name,
-                &format!("left the directory: {reason}"),
-            )?;
+            self.grants.leave(name);
         }
         for entry in directory.appeared {
             let event = json!({ "event": "agent_appeared", "agent": *entry });
@@ -521,7 +549,6 @@ impl Recorder {
 #[derive(Debug, Clone, Copy)]
 #[repr(u8)]
 enum Level {
-    Info = 2,
     Warning = 3,
     Error = 4,
 }

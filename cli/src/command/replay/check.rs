@@ -1,5 +1,6 @@
 //! `fipa replay --check`: judges the letters of a recording.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use fipa::monitor::{Library, Machine};
@@ -19,8 +20,17 @@ struct Counts {
     letters: u64,
     accepted: u64,
     violations: u64,
-    unchecked: u64,
-    excluded: u64,
+    unchecked: Reasons,
+    excluded: Reasons,
+}
+
+/// Numbers of letters by the reason for which they were not judged.
+type Reasons = BTreeMap<String, u64>;
+
+/// Counts a letter. The texts of the reasons are constant, so their number is small.
+fn count(reasons: &mut Reasons, reason: &str) {
+    let number = reasons.entry(reason.to_owned()).or_default();
+    *number += 1;
 }
 
 /// Judges the letters of a file: of all protocols, or of these.
@@ -92,7 +102,7 @@ impl Replay {
         let is_judged = self.only.is_empty()
             || protocol.is_none_or(|name| self.only.contains(&name.to_ascii_lowercase()));
         if !is_judged {
-            self.counts.excluded += 1;
+            count(&mut self.counts.excluded, "of another protocol");
             return Ok(());
         }
         // The time limits of states apply before the letter.
@@ -100,8 +110,9 @@ impl Replay {
         let checked = self.checker.check(recorded.letter());
         match checked {
             CheckResult::Accepted { .. } => self.counts.accepted += 1,
-            CheckResult::Unchecked(_) => self.counts.unchecked += 1,
-            CheckResult::Excluded(_) | CheckResult::Checked => self.counts.excluded += 1,
+            CheckResult::Unchecked(why) => count(&mut self.counts.unchecked, &why.to_string()),
+            CheckResult::Excluded(why) => count(&mut self.counts.excluded, why),
+            CheckResult::Checked => count(&mut self.counts.excluded, "judged before"),
             CheckResult::Violation(violation) => {
                 self.counts.violations += 1;
                 let number = self.counts.letters;
@@ -125,9 +136,11 @@ impl Replay {
             letters,
             accepted,
             violations,
-            unchecked,
-            excluded,
+            unchecked: ref unchecked_reasons,
+            excluded: ref excluded_reasons,
         } = self.counts;
+        let unchecked: u64 = unchecked_reasons.values().sum();
+        let excluded: u64 = excluded_reasons.values().sum();
         if contents.is_filtered {
             report::warn(
                 "letters are left out of this recording by a filter; verdicts may be wrong",
@@ -137,12 +150,22 @@ impl Replay {
             return output::json_line(&json!({
                 "event": "summary", "letters": letters, "accepted": accepted,
                 "violations": violations, "unchecked": unchecked, "excluded": excluded,
-                "complete": contents.is_closed
+                "complete": contents.is_closed, "unchecked_reasons": unchecked_reasons,
+                "excluded_reasons": excluded_reasons,
             }));
         }
         output::text(&format!(
             "letters: {letters}, accepted: {accepted}, violations: {violations}, unchecked: \
              {unchecked}, not judged: {excluded}\n"
-        ))
+        ))?;
+        for (word, reasons) in [
+            ("unchecked", unchecked_reasons),
+            ("not judged", excluded_reasons),
+        ] {
+            for (reason, number) in reasons {
+                output::text(&format!("  {word}: {number}, {reason}\n"))?;
+            }
+        }
+        Ok(())
     }
 }

@@ -37,7 +37,8 @@ Examples:
 JSON with --check, one object on a line:
   { \"event\": \"violation\", \"number\": of the letter, \"time\", \"kind\", \"text\" }
   { \"event\": \"summary\", \"letters\", \"accepted\", \"violations\", \"unchecked\",
-    \"excluded\", \"complete\": false if the file was not closed }
+    \"excluded\", \"complete\": false if the file was not closed,
+    \"unchecked_reasons\" and \"excluded_reasons\": { reason: number } }
 
 JSON with --into:
   { \"letters\", \"sent\", \"failed\", \"left_out\": { reason: number } }")]

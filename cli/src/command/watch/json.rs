@@ -119,6 +119,8 @@ fn fate(object: &mut Map<String, Value>, fate: &Fate) {
     };
     let attempts: Vec<Value> = outcome.attempts().iter().map(attempt).collect();
     object.insert("attempts".to_owned(), attempts.into());
+    let is_settled = matches!(fate, Fate::Settled(_));
+    object.insert("settled".to_owned(), is_settled.into());
 }
 
 fn verdict(checked: &CheckResult) -> Value {

@@ -66,6 +66,7 @@ JSON, one object on a line:
     \"message\": identifier, the same for all receivers of a message,
     \"outcome\": \"delivered\", \"sent\", \"failed\", \"taken\" (seen only at the receiver) or
     \"under_way\", \"reason\", \"attempts\": [ { \"via\", \"location\", \"error\" } ],
+    \"settled\": whether the sender got this outcome; otherwise a gateway had it,
     \"verdict\": { \"verdict\": \"accepted\", \"violation\" or \"unchecked\", ... },
     \"letter\": { \"envelope\", \"effective\", \"message\" } as `fipa decode` prints it }
   { \"event\": \"outcome\", \"number\", \"sender\", \"receiver\", \"outcome\", ... }  of an earlier letter

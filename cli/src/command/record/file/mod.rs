@@ -5,8 +5,8 @@
 //! | `/letters/<receiver>` | a letter: the JSON object of `fipa watch --json`, and `check` |
 //! | `/letters/<receiver>/raw` | the bytes of the letter, if all of them were observed |
 //! | `/letters`, `/letters/raw` | the letters of further receivers, after [`MAX_RECEIVERS`] |
-//! | `/events` | agents, later outcomes, violations, overdue messages and lost records as JSON |
-//! | `/log` | violations, lost records, lost and refused locks as `foxglove.Log` |
+//! | `/events` | agents, gone hosts, later outcomes, violations, overdue messages, locks and lost records as JSON |
+//! | `/log` | violations, lost records, gone hosts, lost, refused and abandoned locks as `foxglove.Log` |
 //! | `/topics/<agent>/<topic>` | the values of a topic with the media type of the topic |
 //!
 //! The times of a letter are its time of sending. A letter and its bytes have the same sequence number.

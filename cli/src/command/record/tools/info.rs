@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 
 use super::super::file::reader::Item;
 use super::super::recorder::rfc3339;
+use super::found::Found;
 use super::read_file;
 use crate::report::Failure;
 use crate::{input, output};
@@ -24,7 +25,8 @@ Examples:
 JSON:
   [ { \"file\", \"closed\", \"damage\": text or null, \"first\" and \"last\": time or null, \"seconds\",
       \"messages\": number, \"channels\": { topic: { \"messages\", \"bytes\", \"encoding\", \"schema\" } },
-      \"metadata\": { name: { key: text } } } ]")]
+      \"metadata\": { name: { key: text } },
+      \"found\": [ { \"count\", \"kind\", \"command\": shows them } ] } ]")]
 pub(in crate::command) struct Arguments {
     /// Recordings
     #[arg(required = true)]
@@ -59,6 +61,7 @@ struct About {
     channels: BTreeMap<String, ChannelAbout>,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
     metadata_bytes: usize,
+    found: Found,
 }
 
 struct ChannelAbout {
@@ -83,6 +86,7 @@ impl About {
     }
 
     fn add(&mut self, item: Item<'_>) {
+        self.found.add(&item);
         match item {
             Item::Message {
                 channel,
@@ -140,7 +144,40 @@ impl About {
             "seconds": self.span().as_secs_f64(), "messages": self.messages,
             "channels": channels.collect::<serde_json::Map<String, Value>>(),
             "metadata": self.metadata,
+            "found": self.found(path).map(|(count, kind, command)| {
+                json!({ "count": count, "kind": kind, "command": command })
+            }).collect::<Vec<Value>>(),
         })
+    }
+
+    /// The kinds of events that were found: their number, their name, and a command that shows them.
+    fn found(&self, path: &Path) -> impl Iterator<Item = (u64, &'static str, String)> {
+        let file = quoted(path);
+        let events = |event: &str| {
+            format!(
+                "fipa record to-json {file} --topic /events | jq -r '.message | select(.event == \"{event}\")'"
+            )
+        };
+        let texts = |event: &str| format!("{} | .text'", events(event).trim_end_matches('\''));
+        let found = &self.found;
+        let failed = u64::try_from(found.failed()).unwrap_or(u64::MAX);
+        [
+            (
+                found.violations,
+                "violation",
+                format!("fipa replay {file} --check"),
+            ),
+            (
+                failed,
+                "letter not delivered",
+                format!("fipa record to-json {file} --failed"),
+            ),
+            (found.abandoned, "abandoned lock", texts("lock_abandoned")),
+            (found.lost, "lost lock", texts("lock_lost")),
+            (found.hosts, "gone host", events("host_gone")),
+        ]
+        .into_iter()
+        .filter(|(count, ..)| *count > 0)
     }
 
     fn text(&self, path: &Path) -> String {
@@ -177,6 +214,19 @@ impl About {
             ]);
         }
         text.push_str(&format!("{}\n", table.trim_fmt()));
+        let mut table = output::table(["FOUND", "NUMBER", "COMMAND"]);
+        let mut is_empty = true;
+        for (count, kind, command) in self.found(path) {
+            is_empty = false;
+            table.add_row([
+                kind.to_owned(),
+                count.to_string(),
+                escape(&command).into_owned(),
+            ]);
+        }
+        if !is_empty {
+            text.push_str(&format!("{}\n", table.trim_fmt()));
+        }
         text
     }
 }
@@ -185,6 +235,16 @@ impl About {
 const MAX_METADATA: usize = 1 << 20;
 /// Bytes that a pair counts in addition to its texts.
 const PAIR: usize = 64;
+
+/// The name of a file in a command of a shell.
+fn quoted(path: &Path) -> String {
+    let name = path.to_string_lossy();
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-+:,@".contains(letter);
+    match name.chars().all(is_plain) {
+        true => name.into_owned(),
+        false => format!("'{}'", name.replace('\'', "'\\''")),
+    }
+}
 
 fn time(nanos: u64) -> String {
     rfc3339(UNIX_EPOCH + Duration::from_nanos(nanos))

@@ -1,6 +1,7 @@
 //! Tools for recordings.
 
 pub(super) mod copy;
+mod found;
 pub(super) mod info;
 mod select;
 pub(super) mod to_json;

@@ -1,6 +1,6 @@
 //! `fipa record to-json`: prints the messages of a recording.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, UNIX_EPOCH};
 
 use base64::Engine as _;
@@ -11,8 +11,9 @@ use serde_json::{Value, json};
 use super::super::file;
 use super::super::file::reader::Item;
 use super::super::recorder::rfc3339;
-use super::read_file;
+use super::found::Found;
 use super::select::{Selection, Selector};
+use super::{read_file, read_quietly};
 use crate::output;
 use crate::report::Failure;
 
@@ -25,6 +26,7 @@ Examples:
   fipa record to-json run.mcap
   fipa record to-json run.mcap --agent arm_1 | jq .message.letter.message.content
   fipa record to-json run.mcap --topic /log | jq -r .message.message
+  fipa record to-json run.mcap --failed | jq -c '.message | [.number, .time, .sender, .receiver, .reason]'
 
 JSON, one object on a line:
   { \"topic\", \"time\": RFC 3339 with milliseconds, \"nanoseconds\": since 1970-01-01T00:00:00Z,
@@ -36,12 +38,20 @@ pub(in crate::command) struct Arguments {
     #[command(flatten)]
     selection: Selection,
 
+    /// Only letters that were not delivered, each with its last outcome
+    ///
+    /// The outcome of a letter can be in a later event. So the command reads the file twice.
+    #[arg(long, conflicts_with = "raw")]
+    failed: bool,
+
     /// Print the bytes of letters, too
     #[arg(long)]
     raw: bool,
 }
 
 pub(in crate::command::record) fn run(arguments: &Arguments) -> Result<(), Failure> {
+    let failed = arguments.failed.then(|| failed(&arguments.file));
+    let failed = failed.transpose()?;
     let mut selector = Selector::new(&arguments.selection);
     read_file(&arguments.file, |item| {
         let is_selected = selector.takes(&item)?;
@@ -65,6 +75,14 @@ pub(in crate::command::record) fn run(arguments: &Arguments) -> Result<(), Failu
             file::JSON => serde_json::from_slice::<Value>(data).ok(),
             _ => None,
         };
+        let message = match (&failed, message) {
+            (None, message) => message,
+            (Some(failed), Some(Value::Object(mut letter))) => match failed.settle(&mut letter) {
+                true => Some(Value::Object(letter)),
+                false => return Ok(()),
+            },
+            (Some(_), _) => return Ok(()),
+        };
         if let Some(object) = line.as_object_mut() {
             match message {
                 Some(message) => object.insert("message".to_owned(), message),
@@ -74,4 +92,21 @@ pub(in crate::command::record) fn run(arguments: &Arguments) -> Result<(), Failu
         output::json_line(&line)
     })?;
     Ok(())
+}
+
+/// Finds the letters that were not delivered.
+fn failed(path: &Path) -> Result<Found, Failure> {
+    if path == Path::new("-") {
+        return Err(Failure::wrong_usage(
+            "--failed reads the recording twice",
+            "standard input",
+            "give the name of a file",
+        ));
+    }
+    let mut found = Found::default();
+    read_quietly(path, |item| {
+        found.add(&item);
+        Ok(())
+    })?;
+    Ok(found)
 }
