@@ -1,6 +1,8 @@
 //! Observes the domain and hands the observations to the thread that writes.
 
 use std::collections::{BTreeMap, HashMap};
+use std::io;
+use std::os::fd::AsFd as _;
 use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,7 +12,10 @@ use fipa::admin::watch::{WatchOptions, Watcher};
 use fipa::{Config, Entry, Incarnation};
 use fipa_acl::escape_name;
 use indicatif::{HumanBytes, ProgressBar, ProgressStyle};
+use serde::{Deserialize, Serialize};
 use serde_json::json;
+use tokio::io::{AsyncBufReadExt as _, BufReader};
+use tokio::net::unix::pipe;
 use tokio::sync::mpsc::{self, Sender};
 use tokio::time::MissedTickBehavior;
 
@@ -27,6 +32,13 @@ use crate::{input, output};
 
 /// Maximum number of observations that wait for the thread that writes. Beyond it the watcher waits.
 const MAX_WAITING: usize = 8192;
+
+/// A metadata record for the file of a recording.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Note {
+    pub(super) name: String,
+    pub(super) pairs: BTreeMap<String, String>,
+}
 
 pub(super) fn run(arguments: &Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
@@ -75,6 +87,7 @@ fn about(config: &Config) -> BTreeMap<String, String> {
 
 async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
+    let notes = arguments.supervised.then(notes).transpose()?;
     let content = arguments.content;
     let watcher = Watcher::open(config, WatchOptions { content }).await;
     let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
@@ -100,6 +113,7 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
         tokio::select! {
             () = recording.observe(&mut watcher, &sender) => {}
             () = follow(topics.as_ref(), &sender) => {}
+            () = forward(notes, &sender) => {}
             () = &mut stopped => {}
             () = &mut over => {}
         }
@@ -120,6 +134,33 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
         Failure::failed(error.to_string(), path, help)
     })??;
     recording.end(arguments)
+}
+
+/// Standard input, which is a pipe from the process that started this one.
+fn notes() -> Result<pipe::Receiver, Failure> {
+    let input = io::stdin().as_fd().try_clone_to_owned();
+    let input = input.and_then(pipe::Receiver::from_owned_fd);
+    input.map_err(|error| {
+        let problem = format!("standard input is no pipe: {error}");
+        Failure::wrong_usage(problem, "standard input", "run the command without --supervised")
+    })
+}
+
+/// Forwards metadata from standard input until its end. Does not return without it.
+async fn forward(notes: Option<pipe::Receiver>, sender: &Sender<Observation>) {
+    let Some(notes) = notes else {
+        return std::future::pending().await;
+    };
+    let mut lines = BufReader::new(notes).lines();
+    while let Ok(Some(line)) = lines.next_line().await {
+        match serde_json::from_str(&line) {
+            // Fails if the thread has ended, and so the recording.
+            Ok(note) => {
+                let _ = sender.send(Observation::Note(note)).await;
+            }
+            Err(error) => report::warn(&format!("a metadata record is left out: {error}")),
+        }
+    }
 }
 
 /// Forwards the values of topics. Does not return without topics.

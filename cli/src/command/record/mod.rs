@@ -2,6 +2,7 @@
 
 mod capture;
 pub(super) mod file;
+pub(super) mod fleet;
 mod locks;
 mod recorder;
 pub(super) mod tools;
@@ -36,6 +37,7 @@ Examples:
   fipa record -o run.mcap --split-size 100MiB --keep 10       the newest GiB
   fipa record -o run.mcap --agent 'arm_.*' --content none
   fipa record -o run.mcap --topics 'camera/.*'
+  fipa record fleet start run1                                on all hosts of the fleet
   fipa record info run.mcap
   fipa record repair run.mcap -o repaired.mcap
   fipa record filter run.mcap -o arm.mcap --agent arm_1
@@ -106,10 +108,16 @@ pub(crate) struct Arguments {
     /// Print JSON, one object on a line
     #[arg(long)]
     json: bool,
+
+    /// Write metadata from standard input, one JSON object on a line, and end with standard input: for `fipa up`
+    #[arg(long, hide = true)]
+    supervised: bool,
 }
 
 #[derive(Debug, Subcommand)]
 enum Tool {
+    #[command(subcommand)]
+    Fleet(fleet::Command),
     Info(tools::info::Arguments),
     Repair(tools::copy::Repair),
     Filter(Box<tools::copy::Filtered>),
@@ -130,6 +138,7 @@ fn content(text: &str) -> Result<usize, String> {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     match arguments.tool {
+        Some(Tool::Fleet(command)) => fleet::run(&command, global),
         Some(Tool::Info(arguments)) => tools::info::run(&arguments),
         Some(Tool::Repair(arguments)) => tools::copy::repair(&arguments),
         Some(Tool::Filter(arguments)) => tools::copy::filter(&arguments),

@@ -12,6 +12,7 @@ use fipa_acl::escape;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
+use super::capture::Note;
 use super::file::writer::{RecordingFile, Split, Stamp, Syncer, Target};
 use super::file::{self, RecordingError, letter};
 use super::locks::Grants;
@@ -29,6 +30,8 @@ pub(super) enum Observation {
     Directory(Directory),
     /// A value of a topic.
     Value(TopicValue),
+    /// Metadata for the file.
+    Note(Note),
     /// Time has passed.
     Tick,
 }
@@ -258,6 +261,7 @@ impl Recorder {
             }
             Observation::Directory(directory) => self.directory(directory),
             Observation::Value(value) => self.value(&value),
+            Observation::Note(note) => self.note(note),
             Observation::Tick => self.overdue(),
             // Events of later versions.
             Observation::Event(_) => Ok(()),
@@ -408,6 +412,12 @@ impl Recorder {
             self.event(SystemTime::now(), &event)?;
         }
         Ok(())
+    }
+
+    fn note(&mut self, note: Note) -> Result<(), Failure> {
+        let open = self.open()?;
+        let written = open.file.write_metadata(&note.name, note.pairs);
+        written.map_err(|error| failed(&error, input::name(&open.path)))
     }
 
     fn overdue(&mut self) -> Result<(), Failure> {
