@@ -142,7 +142,11 @@ fn notes() -> Result<pipe::Receiver, Failure> {
     let input = input.and_then(pipe::Receiver::from_owned_fd);
     input.map_err(|error| {
         let problem = format!("standard input is no pipe: {error}");
-        Failure::wrong_usage(problem, "standard input", "run the command without --supervised")
+        Failure::wrong_usage(
+            problem,
+            "standard input",
+            "run the command without --supervised",
+        )
     })
 }
 

@@ -38,6 +38,7 @@ Examples:
   fipa record -o run.mcap --agent 'arm_.*' --content none
   fipa record -o run.mcap --topics 'camera/.*'
   fipa record fleet start run1                                on all hosts of the fleet
+  fipa record merge run1.*.mcap -o all.mcap
   fipa record info run.mcap
   fipa record repair run.mcap -o repaired.mcap
   fipa record filter run.mcap -o arm.mcap --agent arm_1
@@ -119,6 +120,7 @@ enum Tool {
     #[command(subcommand)]
     Fleet(fleet::Command),
     Info(tools::info::Arguments),
+    Merge(tools::merge::Arguments),
     Repair(tools::copy::Repair),
     Filter(Box<tools::copy::Filtered>),
     ToJson(Box<tools::to_json::Arguments>),
@@ -139,6 +141,7 @@ fn content(text: &str) -> Result<usize, String> {
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     match arguments.tool {
         Some(Tool::Fleet(command)) => fleet::run(&command, global),
+        Some(Tool::Merge(arguments)) => tools::merge::run(&arguments),
         Some(Tool::Info(arguments)) => tools::info::run(&arguments),
         Some(Tool::Repair(arguments)) => tools::copy::repair(&arguments),
         Some(Tool::Filter(arguments)) => tools::copy::filter(&arguments),

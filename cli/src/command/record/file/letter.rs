@@ -90,6 +90,16 @@ fn parts(payload: &Payload) -> [&[u8]; 3] {
     [&payload.head, &payload.content, &payload.tail]
 }
 
+/// Reads the identifier that a letter has in the recordings of all hosts.
+pub(in crate::command) fn read_id(json: &[u8]) -> Option<String> {
+    #[derive(Deserialize)]
+    struct IdJson {
+        letter_id: Option<String>,
+    }
+    let read: IdJson = serde_json::from_slice(json.get(..MAX_LETTER.min(json.len()))?).ok()?;
+    read.letter_id
+}
+
 /// A letter of a recording.
 #[derive(Debug)]
 pub(in crate::command) struct RecordedLetter {

@@ -55,43 +55,129 @@ pub(in crate::command) struct End {
 /// # Errors
 /// Fails if the file cannot be read or has another format, or `visit` fails.
 pub(in crate::command) fn read(
-    mut source: impl Read,
+    source: impl Read,
     failed: impl Fn(&RecordingError) -> Failure,
     mut visit: impl FnMut(Item<'_>) -> Result<(), Failure>,
 ) -> Result<End, Failure> {
-    let mut records = LinearReader::new_with_options(
-        LinearReaderOptions::default()
-            .with_skip_end_magic(true)
-            .with_prevalidate_chunk_crcs(true)
-            .with_record_length_limit(MAX_RECORD),
-    );
-    let mut known = Known::default();
-    let (mut has_begun, mut is_empty) = (false, true);
-    let end = |is_closed, damage| End { is_closed, damage };
-    loop {
-        let (opcode, data) = match records.next_event() {
-            Some(Ok(LinearReadEvent::ReadRequest(need))) => {
-                let space = records.insert(need.min(PIECE));
-                let read = read_piece(&mut source, space).map_err(|error| failed(&error.into()))?;
-                is_empty &= read == 0;
-                records.notify_read(read);
-                continue;
+    let mut file = FileReader::new(source);
+    while let Some(item) = file.next().map_err(|error| failed(&error))? {
+        visit(item)?;
+    }
+    Ok(file.end())
+}
+
+/// Reads a file item by item. Has one chunk of it in memory.
+pub(in crate::command) struct FileReader<R> {
+    records: LinearReader,
+    source: R,
+    known: Known,
+    /// The record of the last item.
+    record: Vec<u8>,
+    has_begun: bool,
+    is_empty: bool,
+    end: Option<End>,
+}
+
+impl<R: Read> FileReader<R> {
+    pub(in crate::command) fn new(source: R) -> Self {
+        Self {
+            records: LinearReader::new_with_options(
+                LinearReaderOptions::default()
+                    .with_skip_end_magic(true)
+                    .with_prevalidate_chunk_crcs(true)
+                    .with_record_length_limit(MAX_RECORD),
+            ),
+            source,
+            known: Known::default(),
+            record: Vec::new(),
+            has_begun: false,
+            is_empty: true,
+            end: None,
+        }
+    }
+
+    /// Returns the next message or metadata; `None` at the last readable record.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be read or has another format.
+    pub(in crate::command) fn next(&mut self) -> Result<Option<Item<'_>>, RecordingError> {
+        if self.end.is_some() {
+            return Ok(None);
+        }
+        let opcode = match self.advance()? {
+            Ok(opcode) => opcode,
+            Err(end) => {
+                self.end = Some(end);
+                return Ok(None);
             }
-            Some(Ok(LinearReadEvent::Record { data, opcode })) => (opcode, data),
-            None | Some(Err(McapError::UnexpectedEof)) if has_begun => return Ok(end(false, None)),
-            None => return Err(failed(&at_beginning(McapError::UnexpectedEof, is_empty))),
-            Some(Err(error)) if has_begun => return Ok(end(false, Some(error.into()))),
-            Some(Err(error)) => return Err(failed(&at_beginning(error, is_empty))),
         };
-        has_begun = true;
-        if opcode == op::FOOTER {
-            return Ok(end(true, None));
+        match self.known.item(opcode, &self.record) {
+            Ok(item) => Ok(Some(item)),
+            Err(error) => {
+                self.end = Some(damaged(error));
+                Ok(None)
+            }
         }
-        match known.item(opcode, data) {
-            Ok(Some(item)) => visit(item)?,
-            Ok(None) => {}
-            Err(error) => return Ok(end(false, Some(error))),
+    }
+
+    /// The end of the file, after its last item.
+    pub(in crate::command) fn end(self) -> End {
+        let open = End {
+            is_closed: false,
+            damage: None,
+        };
+        self.end.unwrap_or(open)
+    }
+
+    /// Reads up to the record of the next item, and returns its opcode.
+    fn advance(&mut self) -> Result<Result<u8, End>, RecordingError> {
+        loop {
+            let (opcode, data) = match self.records.next_event() {
+                Some(Ok(LinearReadEvent::ReadRequest(need))) => {
+                    let space = self.records.insert(need.min(PIECE));
+                    let read = read_piece(&mut self.source, space)?;
+                    self.is_empty &= read == 0;
+                    self.records.notify_read(read);
+                    continue;
+                }
+                Some(Ok(LinearReadEvent::Record { data, opcode })) => (opcode, data),
+                None | Some(Err(McapError::UnexpectedEof)) if self.has_begun => {
+                    return Ok(Err(End {
+                        is_closed: false,
+                        damage: None,
+                    }));
+                }
+                None => return Err(at_beginning(McapError::UnexpectedEof, self.is_empty)),
+                Some(Err(error)) if self.has_begun => return Ok(Err(damaged(error.into()))),
+                Some(Err(error)) => return Err(at_beginning(error, self.is_empty)),
+            };
+            self.has_begun = true;
+            match opcode {
+                op::FOOTER => {
+                    return Ok(Err(End {
+                        is_closed: true,
+                        damage: None,
+                    }));
+                }
+                op::MESSAGE | op::METADATA => {
+                    self.record.clear();
+                    self.record.extend_from_slice(data);
+                    return Ok(Ok(opcode));
+                }
+                other => {
+                    if let Err(error) = self.known.add(other, data) {
+                        return Ok(Err(damaged(error)));
+                    }
+                }
+            }
         }
+    }
+}
+
+fn damaged(error: RecordingError) -> End {
+    End {
+        is_closed: false,
+        damage: Some(error),
     }
 }
 
@@ -122,12 +208,8 @@ struct Known {
 }
 
 impl Known {
-    /// Returns the item of a record, or `None` if it is none.
-    fn item<'a>(
-        &'a mut self,
-        opcode: u8,
-        data: &'a [u8],
-    ) -> Result<Option<Item<'a>>, RecordingError> {
+    /// Adds a schema or a channel. Other records are not parsed.
+    fn add(&mut self, opcode: u8, data: &[u8]) -> Result<(), RecordingError> {
         let malformed = || RecordingError::Malformed(opcode);
         match opcode {
             op::SCHEMA => {
@@ -138,7 +220,6 @@ impl Known {
                     let data = text.to_vec();
                     self.schemas.insert(header.id, FileSchema { header, data });
                 }
-                Ok(None)
             }
             op::CHANNEL => {
                 let channel = fields::channel(data).ok_or_else(malformed)?;
@@ -146,27 +227,29 @@ impl Known {
                     self.count(data.len())?;
                     self.channels.insert(channel.id, channel);
                 }
-                Ok(None)
             }
-            op::MESSAGE => {
-                let (header, data) = fields::message(data).ok_or_else(malformed)?;
-                let id = header.channel_id;
-                let channel = self.channels.get(&id);
-                let channel = channel.ok_or(RecordingError::UnknownChannel(id))?;
-                Ok(Some(Item::Message {
-                    channel,
-                    schema: self.schemas.get(&channel.schema_id),
-                    header,
-                    data,
-                }))
-            }
-            op::METADATA => {
-                let metadata = fields::metadata(data).ok_or_else(malformed)?;
-                Ok(Some(Item::Metadata(metadata)))
-            }
-            // Other records are not parsed.
-            _ => Ok(None),
+            _ => {}
         }
+        Ok(())
+    }
+
+    /// Returns the item of a record, a message or metadata.
+    fn item<'a>(&'a self, opcode: u8, data: &'a [u8]) -> Result<Item<'a>, RecordingError> {
+        let malformed = || RecordingError::Malformed(opcode);
+        if opcode == op::METADATA {
+            let metadata = fields::metadata(data).ok_or_else(malformed)?;
+            return Ok(Item::Metadata(metadata));
+        }
+        let (header, data) = fields::message(data).ok_or_else(malformed)?;
+        let id = header.channel_id;
+        let channel = self.channels.get(&id);
+        let channel = channel.ok_or(RecordingError::UnknownChannel(id))?;
+        Ok(Item::Message {
+            channel,
+            schema: self.schemas.get(&channel.schema_id),
+            header,
+            data,
+        })
     }
 
     fn count(&mut self, bytes: usize) -> Result<(), RecordingError> {

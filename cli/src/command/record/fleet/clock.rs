@@ -149,7 +149,10 @@ mod tests {
         let slow = sample(0, 1_000, 1_000, 1_000);
         let fast = sample(5_000, 5_110, 5_120, 5_030);
         let clock = best("a", &[slow, fast]).unwrap();
-        assert_eq!((clock.offset, clock.uncertainty, clock.at), (100, 10, 5_110));
+        assert_eq!(
+            (clock.offset, clock.uncertainty, clock.at),
+            (100, 10, 5_110)
+        );
     }
 
     #[test]

@@ -241,7 +241,18 @@ mod tests {
         for name in ["run1", "a-b_C", "_", &"x".repeat(64)] {
             assert!(name.parse::<RecordingName>().is_ok(), "{name}");
         }
-        for name in ["", "../x", "a/b", ".", "a.b", "-x", "a b", "ä", "a\0", &"x".repeat(65)] {
+        for name in [
+            "",
+            "../x",
+            "a/b",
+            ".",
+            "a.b",
+            "-x",
+            "a b",
+            "ä",
+            "a\0",
+            &"x".repeat(65),
+        ] {
             assert!(name.parse::<RecordingName>().is_err(), "{name:?}");
         }
     }

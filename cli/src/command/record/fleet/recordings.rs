@@ -162,7 +162,12 @@ impl Recordings {
             command.arg(format!("--content={content}"));
         }
         command.args(options.agents.iter().map(|it| format!("--agent={it}")));
-        command.args(options.protocols.iter().map(|it| format!("--protocol={it}")));
+        command.args(
+            options
+                .protocols
+                .iter()
+                .map(|it| format!("--protocol={it}")),
+        );
         command.args(&self.arguments);
         command
             .stdin(Stdio::piped())
@@ -187,11 +192,7 @@ impl Recordings {
             return Err(RecordingsError::TooMany);
         }
         let mut child = command.spawn()?;
-        let pipes = (
-            child.stdin.take(),
-            child.stdout.take(),
-            child.stderr.take(),
-        );
+        let pipes = (child.stdin.take(), child.stdout.take(), child.stderr.take());
         let (Some(input), Some(output), Some(errors)) = pipes else {
             return Err(io::Error::other("the process of the recording has no pipes").into());
         };
@@ -218,7 +219,11 @@ impl Recordings {
 
     /// Writes a measurement of the clock into the file of a running recording.
     async fn note(&self, name: &RecordingName, record: &str, clock: &Clock) {
-        let notes = self.running.lock().get(name).and_then(|it| it.notes.clone());
+        let notes = self
+            .running
+            .lock()
+            .get(name)
+            .and_then(|it| it.notes.clone());
         let note = Note {
             name: record.to_owned(),
             pairs: clock.to_metadata(&self.host),
@@ -500,7 +505,11 @@ pub(super) fn sha256(mut file: impl Read) -> io::Result<String> {
         }
     }
     let digest = digest.finish();
-    Ok(digest.as_ref().iter().map(|it| format!("{it:02x}")).collect())
+    Ok(digest
+        .as_ref()
+        .iter()
+        .map(|it| format!("{it:02x}"))
+        .collect())
 }
 
 /// Runs work on files on a thread for blocking calls.

@@ -64,9 +64,8 @@ impl RecorderService {
         let server = agent.serve("fipa-request", move |task| {
             handle(task, Arc::clone(&of_orders), known.clone())
         });
-        let server = server.map_err(|error| {
-            Failure::failed(error.to_string(), name, "report this error")
-        })?;
+        let server = server
+            .map_err(|error| Failure::failed(error.to_string(), name, "report this error"))?;
         // Only orders have an effect.
         let receiver = agent.clone();
         let receiving = async move { while receiver.receive().await.is_ok() {} };
