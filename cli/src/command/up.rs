@@ -24,6 +24,9 @@ use crate::service_manager;
 /// the order of mts.transports, mts.deadline, [routes], [access] and discovery.static, and warns about changes
 /// that take effect only after a restart.
 ///
+/// With record.directory, an agent records the letters of this host for the agents in access.recorders
+/// (`fipa record fleet`).
+///
 /// Under systemd, the gateway reports when it is ready, reloads and stops (Type=notify). With WatchdogSec= it also
 /// reports that it works, each time after it has passed a letter to itself.
 ///

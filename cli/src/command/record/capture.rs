@@ -12,7 +12,6 @@ use fipa::admin::watch::{WatchOptions, Watcher};
 use fipa::{Config, Entry, Incarnation};
 use fipa_acl::escape_name;
 use indicatif::{HumanBytes, ProgressBar, ProgressStyle};
-use serde::{Deserialize, Serialize};
 use serde_json::json;
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::net::unix::pipe;
@@ -21,6 +20,7 @@ use tokio::time::MissedTickBehavior;
 
 use super::Arguments;
 use super::file::writer::Split;
+use super::note::Note;
 use super::recorder::{Counts, Directory, Observation, Recorder, Settings};
 use super::topics::Topics;
 use crate::command::watch::TICK;
@@ -32,13 +32,6 @@ use crate::{input, output};
 
 /// Maximum number of observations that wait for the thread that writes. Beyond it the watcher waits.
 const MAX_WAITING: usize = 8192;
-
-/// A metadata record for the file of a recording.
-#[derive(Debug, Serialize, Deserialize)]
-pub(super) struct Note {
-    pub(super) name: String,
-    pub(super) pairs: BTreeMap<String, String>,
-}
 
 pub(super) fn run(arguments: &Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
@@ -157,7 +150,7 @@ async fn forward(notes: Option<pipe::Receiver>, sender: &Sender<Observation>) {
     };
     let mut lines = BufReader::new(notes).lines();
     while let Ok(Some(line)) = lines.next_line().await {
-        match serde_json::from_str(&line) {
+        match Note::read(&line) {
             // Fails if the thread has ended, and so the recording.
             Ok(note) => {
                 let _ = sender.send(Observation::Note(note)).await;

@@ -4,6 +4,7 @@ mod capture;
 pub(super) mod file;
 pub(super) mod fleet;
 mod locks;
+mod note;
 mod recorder;
 pub(super) mod tools;
 mod topics;

@@ -12,10 +12,10 @@ use fipa_acl::escape;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
-use super::capture::Note;
 use super::file::writer::{RecordingFile, Split, Stamp, Syncer, Target};
 use super::file::{self, RecordingError, letter};
 use super::locks::Grants;
+use super::note::Note;
 use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
 use crate::command::watch::filter::Filter;
 use crate::command::watch::{OBSERVATION_DELAY, json};

@@ -8,8 +8,6 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
-use super::order::ClockAnswer;
-
 /// Name of the metadata record with the difference at the beginning of a recording.
 pub(in crate::command) const CLOCK_AT_START: &str = "fipa.clock.start";
 /// Name of the metadata record with the difference at the end of a recording.
@@ -62,6 +60,13 @@ impl Clock {
             at: pairs.get("at_ns")?.parse().ok()?,
         })
     }
+}
+
+/// The times at which a recorder received and answered a question, in nanoseconds since 1970.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(super) struct ClockAnswer {
+    pub(super) received: i64,
+    pub(super) answered: i64,
 }
 
 /// One question about the clock of another host: the times of the own clock before and after it, and the answer.

@@ -14,12 +14,13 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use clap::{Args, Subcommand};
+use clock::ClockAnswer;
 pub(super) use clock::{CLOCK_AT_START, CLOCK_AT_STOP, Clock};
 use fetch::Destination;
 use fipa::protocol::DialogueError;
 use fipa::{Agent, AgentId, Entry, Incarnation, Performative, Reach, RegisterOptions, Role};
 use fipa_acl::escape;
-use order::{ClockAnswer, Listing, Options, Order, ReadError, Recording, RecordingName};
+use order::{Listing, Options, Order, ReadError, Recording, RecordingName};
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use service::name_of_recorder;

@@ -6,7 +6,7 @@
 //! | `list` | a [`Listing`] |
 //! | `read` | the bytes of the file, without a frame |
 //! | `digest` | a [`Digest`] |
-//! | `clock` | [`ClockAnswer`] |
+//! | `clock` | a [`ClockAnswer`](super::clock::ClockAnswer) |
 //!
 //! A recorder refuses an order with the reason as text.
 
@@ -223,13 +223,6 @@ pub(super) struct Listing {
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Digest {
     pub(super) sha256: String,
-}
-
-/// The times at which a recorder received and answered a question, in nanoseconds since 1970.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
-pub(super) struct ClockAnswer {
-    pub(super) received: i64,
-    pub(super) answered: i64,
 }
 
 #[cfg(test)]

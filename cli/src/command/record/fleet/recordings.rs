@@ -26,7 +26,7 @@ use tokio::time::timeout;
 
 use super::clock::{CLOCK_AT_START, CLOCK_AT_STOP, Clock};
 use super::order::{Listing, MAX_LISTED, Options, Recording, RecordingName, State};
-use crate::command::record::capture::Note;
+use crate::command::record::note::Note;
 
 /// Maximum number of recordings at the same time.
 const MAX_RUNNING: usize = 4;
@@ -456,8 +456,7 @@ async fn attend(
         let Some(note) = note else {
             break;
         };
-        let mut line = serde_json::to_vec(&note)?;
-        line.push(b'\n');
+        let line = note.to_line()?;
         // Fails if the process has ended.
         let _ = input.write_all(&line).await;
     }

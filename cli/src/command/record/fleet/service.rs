@@ -11,8 +11,8 @@ use fipa_acl::escape_name;
 use serde::Serialize;
 use tokio::task::JoinHandle;
 
-use super::clock;
-use super::order::{ClockAnswer, Digest, Order};
+use super::clock::{self, ClockAnswer};
+use super::order::{Digest, Order};
 use super::recordings::{Recordings, RecordingsError};
 use crate::membership;
 use crate::options;
@@ -20,6 +20,9 @@ use crate::report::Failure;
 
 /// First part of the names of recorders; the second is the name of their gateway.
 const PREFIX: &str = "recorder@";
+
+/// Maximum number of characters of a reason.
+const MAX_REASON: usize = 400;
 
 /// Returns the name of the recorder of a gateway.
 pub(super) fn name_of_recorder(gateway: &str) -> String {
@@ -131,13 +134,19 @@ async fn handle(
     let content = message.content().map_or(&[][..], |content| content);
     let order = match Order::read(content) {
         Ok(order) => order,
-        Err(error) => return Ok(Reply::Refuse(error.to_string().into())),
+        Err(error) => return Ok(refusal(&error)),
     };
     let done = carry_out(order, &recordings, received).await;
     Ok(match done {
         Ok(answer) => Reply::Inform(answer),
-        Err(error) => Reply::Refuse(error.to_string().into()),
+        Err(error) => refusal(&error),
     })
+}
+
+/// A refusal with the reason, which can repeat a text of the order.
+fn refusal(error: &impl ToString) -> Reply {
+    let reason: String = error.to_string().chars().take(MAX_REASON).collect();
+    Reply::Refuse(reason.into())
 }
 
 async fn carry_out(
