@@ -204,7 +204,7 @@ impl Shift {
             [(start, before), (end, after), ..] if start < end => {
                 let [start, end, before, after] = [start, end, before, after].map(i128::from);
                 let passed = time.clamp(start, end) - start;
-                before + (after - before) * passed / (end - start)
+                before + (after - before).saturating_mul(passed) / (end - start)
             }
             [(_, offset), ..] => i128::from(offset),
         };
