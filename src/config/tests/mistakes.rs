@@ -27,12 +27,12 @@ fn mistakes_are_reported_with_line_and_key() {
             "[discover]\nmdns = true\n",
             "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
              (known at the top: domain, runtime_dir, group, mts, transport, discovery, security, http, contacts, access, \
-             monitor, platform, routes)",
+             monitor, platform, record, routes)",
         ),
         (
             "[radio]\nrate = 1\n",
             "fipa.toml:1: unknown key `radio`; known at the top: domain, runtime_dir, group, mts, transport, discovery, \
-             security, http, contacts, access, monitor, platform, routes",
+             security, http, contacts, access, monitor, platform, record, routes",
         ),
         (
             "[transport.serial]\nlisten = []\n",
