@@ -147,6 +147,7 @@ networks = []                        # default
 [access]
 rate = 0                             # default
 operators = []                       # default
+recorders = []                       # default
 
 [monitor]
 check = \"off\"                        # default
@@ -161,6 +162,10 @@ exempt = []                          # default
 [platform]
 ams = true                           # default
 df = true                            # default
+
+[record]
+directory = \"\"                       # default
+bytes = \"1GiB\"                       # default
 
 [routes]
 \"arm_.*\" = [\"tcp\"]                   # fipa.toml:5

@@ -111,12 +111,17 @@ impl Entry {
     /// Type of the directory facilitator of a gateway (FIPA00023).
     pub const DF_TYPE: &str = "fipa-df";
 
-    /// Whether the entry is that of an agent management system or directory facilitator, by its type.
+    /// Type of the agent of a gateway that records letters.
+    pub const RECORDER_TYPE: &str = "fipa-recorder";
+
+    /// Whether the entry is that of an agent of a gateway, by its type: an agent management system, a directory
+    /// facilitator or a recorder.
     /// Patterns do not match it: `.*` addresses the agents of robots.
     #[must_use]
     pub fn is_platform_agent(&self) -> bool {
         let agent_type = self.agent_type.as_str();
-        self.role == Role::Agent && (agent_type == Self::AMS_TYPE || agent_type == Self::DF_TYPE)
+        let types = [Self::AMS_TYPE, Self::DF_TYPE, Self::RECORDER_TYPE];
+        self.role == Role::Agent && types.contains(&agent_type)
     }
 
     /// Whether the entry has locations, and all of them use transports that this project does not

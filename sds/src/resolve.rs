@@ -190,7 +190,11 @@ mod tests {
     #[test]
     fn platform_agents_are_left_out_of_a_multicast() {
         let directory = directory(&["arm"]);
-        for (name, agent_type) in [("ams@mts", Entry::AMS_TYPE), ("df@mts", Entry::DF_TYPE)] {
+        for (name, agent_type) in [
+            ("ams@mts", Entry::AMS_TYPE),
+            ("df@mts", Entry::DF_TYPE),
+            ("recorder@mts", Entry::RECORDER_TYPE),
+        ] {
             let mut agent = Registration::new(name, Incarnation::random(), Vec::new());
             agent.agent_type = agent_type.to_owned();
             directory.register(agent).unwrap();

@@ -73,6 +73,11 @@ impl RulesGate {
         self.access.lock().is_operator(agent)
     }
 
+    /// Whether the agent with this name may record on this host (`access.recorders`).
+    pub(crate) fn is_recorder(&self, agent: &str) -> bool {
+        self.access.lock().is_recorder(agent)
+    }
+
     /// Reads the parts of a message with this sender in its envelope.
     fn parts_of(&self, message: &MessageView<'_>, sender: String) -> LetterParts {
         let signed = message.sender().map(|it| it.name());

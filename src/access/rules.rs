@@ -63,6 +63,8 @@ pub(crate) struct Access {
     /// The agents that may cancel goals of other clients, and read their results.
     #[cfg(feature = "actions")]
     operators: Vec<Matcher>,
+    /// The agents that may record on this host and fetch its recordings.
+    recorders: Vec<Matcher>,
     /// Maximum number of letters per second and sender; `None` means unlimited.
     rate: Option<f64>,
     senders: Senders,
@@ -110,19 +112,20 @@ struct Rule {
 struct Sender(TokenBucket);
 
 impl Access {
-    /// Parses these entries, each a sender and its receivers, and the patterns of operators. `rate` is the
+    /// Parses these entries, each a sender and its receivers, and the patterns of operators and recorders. `rate` is the
     /// maximum number of letters per second and sender; 0 means unlimited. Returns `None` if there is
     /// nothing to check.
     pub(crate) fn new<'a>(
         deny: impl IntoIterator<Item = Line<'a>>,
         allow: impl IntoIterator<Item = Line<'a>>,
         operators: &[String],
+        recorders: &[String],
         rate: usize,
     ) -> Result<Option<Self>, RuleError> {
         let (deny, allow) = (rules(deny)?, rules(allow)?);
-        let operators = operators.iter().map(|it| matcher(it));
-        let operators: Vec<Matcher> = operators.collect::<Result<_, _>>()?;
-        if deny.is_empty() && allow.is_empty() && operators.is_empty() && rate == 0 {
+        let (operators, recorders) = (matchers(operators)?, matchers(recorders)?);
+        let names_agents = !operators.is_empty() || !recorders.is_empty();
+        if deny.is_empty() && allow.is_empty() && !names_agents && rate == 0 {
             return Ok(None);
         }
         Ok(Some(Self {
@@ -130,6 +133,7 @@ impl Access {
             allow,
             #[cfg(feature = "actions")]
             operators,
+            recorders,
             rate: (rate > 0).then_some(rate as f64),
             senders: Senders::default(),
         }))
@@ -146,6 +150,11 @@ impl Access {
     #[cfg(feature = "actions")]
     pub(crate) fn is_operator(&self, agent: &str) -> bool {
         self.operators.iter().any(|it| it.matches(agent))
+    }
+
+    /// Whether the agent with this name may record on this host and fetch its recordings.
+    pub(crate) fn is_recorder(&self, agent: &str) -> bool {
+        self.recorders.iter().any(|it| it.matches(agent))
     }
 
     /// Checks a letter against the rules.
@@ -343,8 +352,12 @@ fn matcher(text: &str) -> Result<Matcher, RuleError> {
     })
 }
 
-/// Returns the error of a pattern of operators, if it has one.
-pub(crate) fn fault_of_operator(pattern: &str) -> Option<RuleError> {
+fn matchers(patterns: &[String]) -> Result<Vec<Matcher>, RuleError> {
+    patterns.iter().map(|it| matcher(it)).collect()
+}
+
+/// Returns the error of a pattern of operators or recorders, if it has one.
+pub(crate) fn fault_of_agents(pattern: &str) -> Option<RuleError> {
     match pattern.is_empty() {
         true => Some(RuleError("has an empty name".to_owned())),
         false => matcher(pattern).err(),
@@ -388,7 +401,7 @@ mod tests {
             lines.collect()
         };
         let (deny, allow) = (owned(deny), owned(allow));
-        Access::new(lines(&deny), lines(&allow), &[], rate)
+        Access::new(lines(&deny), lines(&allow), &[], &[], rate)
             .unwrap()
             .unwrap()
     }
@@ -397,7 +410,7 @@ mod tests {
     #[test]
     fn operators_are_those_that_a_pattern_names() {
         let patterns = ["boss".to_owned(), "desk_[0-9]+".to_owned()];
-        let access = Access::new([], [], &patterns, 0).unwrap().unwrap();
+        let access = Access::new([], [], &patterns, &[], 0).unwrap().unwrap();
         for (agent, is_operator) in [
             ("boss", true),
             ("desk_7", true),
@@ -408,11 +421,21 @@ mod tests {
             assert_eq!(access.is_operator(agent), is_operator, "{agent}");
         }
         assert_eq!(access.judge(&facts("rover", "arm")), Ok(()));
-        assert!(Access::new([], [], &[], 0).unwrap().is_none());
+        assert!(Access::new([], [], &[], &[], 0).unwrap().is_none());
         for wrong in ["", "arm_("] {
-            assert!(fault_of_operator(wrong).is_some(), "{wrong:?}");
+            assert!(fault_of_agents(wrong).is_some(), "{wrong:?}");
         }
         assert!(!Access::default().is_operator("boss"));
+    }
+
+    #[test]
+    fn recorders_are_no_operators() {
+        let access = Access::new([], [], &[], &["station_.*".to_owned()], 0);
+        let access = access.unwrap().unwrap();
+        assert!(access.is_recorder("station_1") && !access.is_recorder("rover"));
+        #[cfg(feature = "actions")]
+        assert!(!access.is_operator("station_1"));
+        assert!(!Access::default().is_recorder("station_1"));
     }
 
     fn facts<'a>(sender: &'a str, receiver: &'a str) -> LetterFacts<'a> {

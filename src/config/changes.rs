@@ -19,7 +19,7 @@ pub struct Reloaded {
 }
 
 /// The keys that only gateways use, as they begin.
-const OF_GATEWAY: [&str; 16] = [
+const OF_GATEWAY: [&str; 17] = [
     "mts.name",
     "transport.tcp.listen",
     "transport.udp.",
@@ -36,6 +36,7 @@ const OF_GATEWAY: [&str; 16] = [
     "http.",
     "contacts.",
     "platform.",
+    "record.",
 ];
 
 /// Whether only gateways use this key.

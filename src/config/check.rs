@@ -30,8 +30,11 @@ const MAX_QUEUE: usize = 65_536;
 const MONITORED: RangeInclusive<usize> = 8..=10_000_000;
 /// Bounds of `mts.queue_bytes` and of `monitor.bytes`.
 const QUEUE_BYTES: RangeInclusive<u64> = 64 << 10..=1 << 40;
-/// Maximum number of lines of each of `[routes]`, `access.allow`, `access.deny` and `access.operators`.
+/// Maximum number of lines of each of `[routes]`, `access.allow`, `access.deny`, `access.operators` and
+/// `access.recorders`.
 const MAX_ROUTES: usize = 256;
+/// Bounds of `record.bytes`.
+const RECORDED: RangeInclusive<u64> = 1 << 20..=1 << 40;
 /// Upper bound of `access.rate`, in letters per second.
 const MAX_RATE: usize = 1_000_000;
 /// Bounds of `transport.shm.capacity`, in bytes.
@@ -144,6 +147,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.protocols(&config.monitor.protocols);
     found.platform(&config.platform, &config.mts.name);
     found.monitor(&config.monitor);
+    found.record(&config.record);
     found.0
 }
 
@@ -311,14 +315,19 @@ impl Findings {
             let help = format!("use 0 to {MAX_RATE} letters per second");
             self.add(&["access", "rate"], what, help);
         }
-        if access.operators.len() > MAX_ROUTES {
-            self.too_many(&["access", "operators"], access.operators.len(), MAX_ROUTES);
-        } else {
-            let mut operators = access.operators.iter();
-            let fault = operators.find_map(|it| crate::access::rules::fault_of_operator(it));
-            if let Some(fault) = fault {
+        for (name, agents) in [
+            ("operators", &access.operators),
+            ("recorders", &access.recorders),
+        ] {
+            let path = ["access", name];
+            if agents.len() > MAX_ROUTES {
+                self.too_many(&path, agents.len(), MAX_ROUTES);
+                continue;
+            }
+            let mut agents = agents.iter();
+            if let Some(fault) = agents.find_map(|it| crate::access::rules::fault_of_agents(it)) {
                 let help = "list names or patterns of agents such as \"boss\"";
-                self.add(&["access", "operators"], fault, help);
+                self.add(&path, fault, help);
             }
         }
         for (name, lines) in [("allow", &access.allow), ("deny", &access.deny)] {
@@ -416,6 +425,23 @@ impl Findings {
                 &["mts", "queue_bytes"],
                 format_args!("cannot be {} bytes", mts.queue_bytes),
                 "use 64KiB to 1TiB",
+            );
+        }
+    }
+
+    fn record(&mut self, record: &super::Record) {
+        if record.directory.starts_with('~') {
+            self.add(
+                &["record", "directory"],
+                "begins with ~, which only shells expand",
+                "write the full path, for example /var/lib/fipa/recordings",
+            );
+        }
+        if !RECORDED.contains(&record.bytes) {
+            self.add(
+                &["record", "bytes"],
+                format_args!("cannot be {} bytes", record.bytes),
+                "use 1MiB to 1TiB",
             );
         }
     }

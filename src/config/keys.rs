@@ -360,6 +360,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.access.operators),
     },
     Key {
+        path: &["access", "recorders"],
+        shape: Shape::List,
+        expected: r#"a list of names or patterns of agents such as ["station"]"#,
+        write: |config, value| items(value, text).map(|all| config.access.recorders = all),
+        read: |config| Value::list(&config.access.recorders),
+    },
+    Key {
         path: &["monitor", "check"],
         shape: Shape::Text,
         expected: r#""off", "warn" or "enforce""#,
@@ -428,6 +435,20 @@ pub(super) const KEYS: &[Key] = &[
         expected: PLATFORM_AGENT,
         write: |config, value| platform_agent(value).map(|df| config.platform.df = df),
         read: |config| platform_agent_value(&config.platform.df),
+    },
+    Key {
+        path: &["record", "directory"],
+        shape: Shape::Text,
+        expected: r#"a directory such as "/var/lib/fipa/recordings", or "" for none"#,
+        write: |config, value| text(value).map(|directory| config.record.directory = directory),
+        read: |config| Value::Text(config.record.directory.clone()),
+    },
+    Key {
+        path: &["record", "bytes"],
+        shape: Shape::Text,
+        expected: r#"a size such as "1GiB""#,
+        write: |config, value| size(value).map(|bytes| config.record.bytes = bytes),
+        read: |config| size_text(config.record.bytes),
     },
 ];
 

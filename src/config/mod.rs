@@ -60,6 +60,7 @@
 //! allow = { "rover_.*" = ["arm performative=request"] }   # all others are refused (none by default)
 //! deny = { ".*" = ["brake"] }         # takes precedence over `allow` (none by default)
 //! operators = []                      # agents that may cancel all goals of the robots of this process
+//! recorders = []                      # agents that may record on this host and fetch its recordings
 //! [monitor]
 //! check = "off"                       # or "warn", "enforce": reaction to protocol violations
 //! answer = false                      # true: violations are answered with not-understood
@@ -72,6 +73,9 @@
 //! [platform]
 //! ams = true                          # false: no agent management system; or its name
 //! df = true                           # false: no directory facilitator; or its name
+//! [record]
+//! directory = ""                      # of the recordings that access.recorders order; empty: none
+//! bytes = "1GiB"                      # of all of them; the oldest is deleted
 //! ```
 //!
 //! Not in this module: opening anything that the configuration names. A transport that this process
@@ -145,6 +149,8 @@ pub struct Config {
     pub monitor: Monitor,
     /// `[platform]`: the agents of the gateway that list agents and services (FIPA00023).
     pub platform: Platform,
+    /// `[record]`: the recordings that agents of other hosts order from the gateway.
+    pub record: Record,
 }
 
 /// `[mts]`: the message transport service of a process.
@@ -350,6 +356,9 @@ pub struct Access {
     /// `operators`: names or patterns of the agents that may cancel the goals of other clients, and read their
     /// results, where this process offers actions (feature `actions`). At most 256.
     pub operators: Vec<String>,
+    /// `recorders`: names or patterns of the agents that may record the letters of this host and fetch the recordings,
+    /// where the gateway records ([`Record`]). At most 256.
+    pub recorders: Vec<String>,
 }
 
 /// One line of `access.allow` or `access.deny`.
@@ -374,7 +383,7 @@ impl Access {
     pub(crate) fn rules(&self) -> Result<Option<rules::Access>, RuleError> {
         let deny = self.deny.iter().map(AccessRule::parts);
         let allow = self.allow.iter().map(AccessRule::parts);
-        rules::Access::new(deny, allow, &self.operators, self.rate)
+        rules::Access::new(deny, allow, &self.operators, &self.recorders, self.rate)
     }
 }
 
@@ -444,6 +453,16 @@ pub struct Platform {
     pub ams: PlatformAgent,
     /// `df`: the directory facilitator, `df@` and the name of the gateway by default.
     pub df: PlatformAgent,
+}
+
+/// `[record]`: the recordings that agents, also those of other hosts, order from the gateway (`fipa record fleet`).
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Record {
+    /// `directory`: the directory of the recordings. Empty: no agent records on this host.
+    pub directory: String,
+    /// `bytes`: the maximum size of all recordings in the directory, 1 MiB to 1 TiB. Beyond it the oldest is deleted.
+    pub bytes: u64,
 }
 
 /// An agent of the gateway: `true`, `false` or a name.
@@ -562,6 +581,10 @@ impl Config {
                 exempt: Vec::new(),
             },
             platform: Platform::default(),
+            record: Record {
+                directory: String::new(),
+                bytes: 1 << 30,
+            },
         }
     }
 

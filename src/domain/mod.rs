@@ -326,6 +326,14 @@ impl Domain {
         Ok(reloaded)
     }
 
+    /// Whether the agent with this name may record the letters of this host and fetch the recordings
+    /// (`access.recorders`). While an agent may, the sender of a received message is the one of its envelope, which other
+    /// rules of `[access]` check, too.
+    #[must_use]
+    pub fn is_recorder(&self, agent: &str) -> bool {
+        self.inner.service.gate().is_recorder(agent)
+    }
+
     /// Reads the configuration from these sources again whenever `fipa reload` requests it, and
     /// [applies](Self::reload) it, as long as the process takes part in the domain. A call replaces the sources of
     /// the previous one. With the result, the program reads it at other times, for example after SIGHUP.

@@ -338,7 +338,6 @@ impl Service {
     }
 
     /// Returns the access gate.
-    #[cfg(feature = "actions")]
     pub(crate) fn gate(&self) -> Arc<RulesGate> {
         Arc::clone(&self.gate)
     }

@@ -563,7 +563,7 @@ impl Contested {
         let (name, mts) = (&entry.name, escape_name(claim.mts.shown()));
         log_limit::warn!(name = %escape_name(name), other = %mts, "an agent of another host has the same name");
         if entry.is_platform_agent() {
-            // It gets a second name.
+            // The agent management system and the directory facilitator get second names.
             return;
         }
         let content = format!(

@@ -7,10 +7,11 @@ use fipa::{Config, Gateway, log_limit};
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
 
+use crate::command::record::fleet::service::RecorderService;
 use crate::membership::{self, SignalRequest, Stop};
 use crate::options::{self, Global};
 use crate::output;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 use crate::service_manager;
 
 /// Run the gateway, which connects the agents of this host with agents on other hosts
@@ -22,6 +23,9 @@ use crate::service_manager;
 /// On `fipa reload` and SIGHUP (`kill -HUP`) the gateway reads its configuration again and loses no letter. It applies
 /// the order of mts.transports, mts.deadline, [routes], [access] and discovery.static, and warns about changes
 /// that take effect only after a restart.
+///
+/// With record.directory, an agent records the letters of this host for the agents in access.recorders
+/// (`fipa record fleet`).
 ///
 /// Under systemd, the gateway reports when it is ready, reloads and stops (Type=notify). With WatchdogSec= it also
 /// reports that it works, each time after it has passed a letter to itself.
@@ -41,6 +45,7 @@ Examples:
 JSON, one line when the gateway is ready:
   { \"name\": text, \"incarnation\": text, \"domain\": text, \"locations\": [ text ],
     \"http\": { \"address\": text, \"token_file\": text } or null without http.listen,
+    \"recorder\": name of the agent that records, or null without record.directory,
     \"discovery\": { \"mdns\": true or false, \"problem\": text, if there is one },
     \"security\": { \"encrypted\": true or false, \"insecure\": security.insecure,
                   \"trusted\": [ { \"mts\": text, \"fingerprint\": text } ] } }")]
@@ -62,10 +67,27 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
     let mut problems = gateway.discovery_problem();
     let mut problem = problems.borrow_and_update().clone();
     let mut reloads = gateway.reload_requests();
+    // Letters do not depend on the recorder.
+    let recorder = RecorderService::start(config, gateway.name()).await;
+    let recorder = recorder.unwrap_or_else(|failure| {
+        report::warn(&format!("no recorder runs: {}", failure.problem()));
+        None
+    });
+    let name_of_recorder = recorder.as_ref().map(RecorderService::name);
     if json {
-        output::json_line(&ready_json(config, &gateway, problem.as_deref()))?;
+        output::json_line(&ready_json(
+            config,
+            &gateway,
+            problem.as_deref(),
+            name_of_recorder,
+        ))?;
     } else {
-        output::text(&ready(config, &gateway, problem.as_deref()))?;
+        output::text(&ready(
+            config,
+            &gateway,
+            problem.as_deref(),
+            name_of_recorder,
+        ))?;
     }
     let name = escape_name(gateway.name());
     service_manager::ready(&format!("gateway {name} of domain {}", config.domain));
@@ -101,6 +123,9 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
         watchdog.abort();
     }
     Stop::ending();
+    if let Some(recorder) = recorder {
+        recorder.close().await;
+    }
     gateway.close().await;
     Ok(())
 }
@@ -119,7 +144,12 @@ fn reload(gateway: &mut Gateway, global: &Global) -> Result<Reloaded, ConfigErro
     reloaded
 }
 
-fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
+fn ready(
+    config: &Config,
+    gateway: &Gateway,
+    problem: Option<&str>,
+    recorder: Option<&str>,
+) -> String {
     let mut text = format!(
         "gateway {} of domain {} is ready\n",
         escape_name(gateway.name()),
@@ -133,6 +163,13 @@ fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
         let token = escape(&token.to_string_lossy()).into_owned();
         text.push_str(&format!(
             "  metrics at http://{address}/metrics, with the token in {token}\n"
+        ));
+    }
+    if let Some(recorder) = recorder {
+        text.push_str(&format!(
+            "  recordings in {}, by {}\n",
+            escape(&config.record.directory),
+            escape_name(recorder)
         ));
     }
     text.push_str(&format!("  other hosts: {}\n", trusted_hosts(config)));
@@ -179,7 +216,12 @@ fn trusted(config: &Config) -> Vec<Certificate> {
     trusted.unwrap_or_default()
 }
 
-fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Value {
+fn ready_json(
+    config: &Config,
+    gateway: &Gateway,
+    problem: Option<&str>,
+    recorder: Option<&str>,
+) -> Value {
     let locations = gateway.locations();
     let locations = locations.iter().map(ToString::to_string);
     let mut discovery = json!({ "mdns": config.discovery.mdns });
@@ -195,6 +237,7 @@ fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Valu
             "address": address.to_string(),
             "token_file": gateway.web_token_file().to_string_lossy(),
         })),
+        "recorder": recorder,
         "discovery": discovery,
         "security": {
             "encrypted": !config.security.keys.is_empty(),

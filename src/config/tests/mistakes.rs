@@ -21,18 +21,18 @@ fn mistakes_are_reported_with_line_and_key() {
             "deadline = \"5s\"\n",
             "fipa.toml:1: unknown key `deadline`; did you mean `mts.deadline`? \
              (known at the top: domain, runtime_dir, group, mts, transport, discovery, security, http, contacts, access, \
-             monitor, platform, routes)",
+             monitor, platform, record, routes)",
         ),
         (
             "[discover]\nmdns = true\n",
             "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
              (known at the top: domain, runtime_dir, group, mts, transport, discovery, security, http, contacts, access, \
-             monitor, platform, routes)",
+             monitor, platform, record, routes)",
         ),
         (
             "[radio]\nrate = 1\n",
             "fipa.toml:1: unknown key `radio`; known at the top: domain, runtime_dir, group, mts, transport, discovery, \
-             security, http, contacts, access, monitor, platform, routes",
+             security, http, contacts, access, monitor, platform, record, routes",
         ),
         (
             "[transport.serial]\nlisten = []\n",
@@ -409,6 +409,20 @@ fn mistakes_in_set_arguments_name_the_argument() {
          write [mts] and below it some of its keys: \
              name, transports, deadline, queue, queue_bytes, raise_open_files"
     );
+    for (set, expected) in [
+        (
+            "record.bytes=1KiB",
+            "cannot be 1024 bytes; use 1MiB to 1TiB",
+        ),
+        ("record.directory=~/r", "begins with ~"),
+        (
+            "access.recorders=[\"arm_(\"]",
+            "list names or patterns of agents",
+        ),
+    ] {
+        let text = error("", &[set]);
+        assert!(text.contains(expected), "{text}");
+    }
     assert_eq!(
         error("", &["mts.queue=x\u{1b}[31m"]),
         "--set mts.queue=x\\u{1b}[31m: `mts.queue` is invalid: \"x\\u001B[31m\": \

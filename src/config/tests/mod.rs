@@ -386,6 +386,7 @@ networks = []                        # default
 [access]
 rate = 0                             # default
 operators = []                       # default
+recorders = []                       # default
 
 [monitor]
 check = "off"                        # default
@@ -400,6 +401,10 @@ exempt = []                          # default
 [platform]
 ams = true                           # default
 df = true                            # default
+
+[record]
+directory = ""                       # default
+bytes = "1GiB"                       # default
 
 [routes]
 "a b" = ["tcp"]                      # --set

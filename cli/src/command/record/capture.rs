@@ -1,6 +1,8 @@
 //! Observes the domain and hands the observations to the thread that writes.
 
 use std::collections::{BTreeMap, HashMap};
+use std::io;
+use std::os::fd::AsFd as _;
 use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,12 +13,15 @@ use fipa::{Config, Entry, Incarnation};
 use fipa_acl::escape_name;
 use indicatif::{HumanBytes, ProgressBar, ProgressStyle};
 use serde_json::json;
+use tokio::io::{AsyncBufReadExt as _, BufReader};
+use tokio::net::unix::pipe;
 use tokio::sync::mpsc::{self, Sender};
 use tokio::time::MissedTickBehavior;
 
 use super::Arguments;
 use super::file::writer::Split;
 use super::hosts::HOST_GONE;
+use super::note::Note;
 use super::recorder::{Counts, Directory, Observation, Recorder, Settings};
 use super::topics::Topics;
 use crate::command::watch::TICK;
@@ -76,6 +81,7 @@ fn about(config: &Config) -> BTreeMap<String, String> {
 
 async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
+    let notes = arguments.supervised.then(notes).transpose()?;
     let content = arguments.content;
     let watcher = Watcher::open(config, WatchOptions { content }).await;
     let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
@@ -101,6 +107,7 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
         tokio::select! {
             () = recording.observe(&mut watcher, &sender) => {}
             () = follow(topics.as_ref(), &sender) => {}
+            () = forward(notes, &sender) => {}
             () = &mut stopped => {}
             () = &mut over => {}
         }
@@ -121,6 +128,37 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
         Failure::failed(error.to_string(), path, help)
     })??;
     recording.end(arguments)
+}
+
+/// Standard input, which is a pipe from the process that started this one.
+fn notes() -> Result<pipe::Receiver, Failure> {
+    let input = io::stdin().as_fd().try_clone_to_owned();
+    let input = input.and_then(pipe::Receiver::from_owned_fd);
+    input.map_err(|error| {
+        let problem = format!("standard input is no pipe: {error}");
+        Failure::wrong_usage(
+            problem,
+            "standard input",
+            "run the command without --supervised",
+        )
+    })
+}
+
+/// Forwards metadata from standard input until its end. Does not return without it.
+async fn forward(notes: Option<pipe::Receiver>, sender: &Sender<Observation>) {
+    let Some(notes) = notes else {
+        return std::future::pending().await;
+    };
+    let mut lines = BufReader::new(notes).lines();
+    while let Ok(Some(line)) = lines.next_line().await {
+        match Note::read(&line) {
+            // Fails if the thread has ended, and so the recording.
+            Ok(note) => {
+                let _ = sender.send(Observation::Note(note)).await;
+            }
+            Err(error) => report::warn(&format!("a metadata record is left out: {error}")),
+        }
+    }
 }
 
 /// Forwards the values of topics. Does not return without topics.

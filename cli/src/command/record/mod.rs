@@ -3,7 +3,9 @@
 mod capture;
 pub(super) mod file;
 mod hosts;
+pub(super) mod fleet;
 mod locks;
+mod note;
 mod recorder;
 pub(super) mod tools;
 mod topics;
@@ -38,6 +40,8 @@ Examples:
   fipa record -o run.mcap --split-size 100MiB --keep 10       the newest GiB
   fipa record -o run.mcap --agent 'arm_.*' --content none
   fipa record -o run.mcap --topics 'camera/.*'
+  fipa record fleet start run1                                on all hosts of the fleet
+  fipa record merge run1.*.mcap -o all.mcap
   fipa record info run.mcap
   fipa record repair run.mcap -o repaired.mcap
   fipa record filter run.mcap -o arm.mcap --agent arm_1
@@ -110,11 +114,18 @@ pub(crate) struct Arguments {
     /// Print JSON, one object on a line
     #[arg(long)]
     json: bool,
+
+    /// Write metadata from standard input, one JSON object on a line, and end with standard input: for `fipa up`
+    #[arg(long, hide = true)]
+    supervised: bool,
 }
 
 #[derive(Debug, Subcommand)]
 enum Tool {
+    #[command(subcommand)]
+    Fleet(fleet::Command),
     Info(tools::info::Arguments),
+    Merge(tools::merge::Arguments),
     Repair(tools::copy::Repair),
     Filter(Box<tools::copy::Filtered>),
     ToJson(Box<tools::to_json::Arguments>),
@@ -142,6 +153,8 @@ fn content(text: &str) -> Result<usize, String> {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     match arguments.tool {
+        Some(Tool::Fleet(command)) => fleet::run(&command, global),
+        Some(Tool::Merge(arguments)) => tools::merge::run(&arguments),
         Some(Tool::Info(arguments)) => tools::info::run(&arguments),
         Some(Tool::Repair(arguments)) => tools::copy::repair(&arguments),
         Some(Tool::Filter(arguments)) => tools::copy::filter(&arguments),

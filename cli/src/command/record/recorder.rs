@@ -18,6 +18,7 @@ use super::file::writer::{RecordingFile, Split, Stamp, Syncer, Target};
 use super::file::{self, RecordingError, letter};
 use super::hosts::Hosts;
 use super::locks::{Grants, LockEvent};
+use super::note::Note;
 use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
 use crate::command::watch::filter::Filter;
 use crate::command::watch::{OBSERVATION_DELAY, json};
@@ -32,6 +33,8 @@ pub(super) enum Observation {
     Directory(Directory),
     /// A value of a topic.
     Value(TopicValue),
+    /// Metadata for the file.
+    Note(Note),
     /// Time has passed.
     Tick,
 }
@@ -263,6 +266,7 @@ impl Recorder {
             }
             Observation::Directory(directory) => self.directory(directory),
             Observation::Value(value) => self.value(&value),
+            Observation::Note(note) => self.note(note),
             Observation::Tick => self.overdue(),
             // Events of later versions.
             Observation::Event(_) => Ok(()),
@@ -447,6 +451,12 @@ impl Recorder {
             self.event(SystemTime::now(), &event)?;
         }
         Ok(())
+    }
+
+    fn note(&mut self, note: Note) -> Result<(), Failure> {
+        let open = self.open()?;
+        let written = open.file.write_metadata(&note.name, note.pairs);
+        written.map_err(|error| failed(&error, input::name(&open.path)))
     }
 
     fn overdue(&mut self) -> Result<(), Failure> {

@@ -6,7 +6,7 @@
 //! * `may_continue`: its conversation may have begun before the recording,
 //! * `after_loss`: letters before this one are missing.
 //!
-//! An absent key of `check` is false.
+//! An absent key of `check` is false. `letter_id` is the same in the recordings of all hosts on the way of the letter.
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -64,6 +64,10 @@ pub(in crate::command) fn to_json(
     };
     let mut object = json::letter_object(passage, checked);
     object.insert("check".to_owned(), serde_json::to_value(check)?);
+    if passage.stream.sender.is_known() {
+        let id = format!("{}/{}", passage.stream.sender, passage.sequence);
+        object.insert("letter_id".to_owned(), id.into());
+    }
     serde_json::to_vec(&object)
 }
 
@@ -84,6 +88,16 @@ pub(in crate::command) fn to_bytes(passage: &Passage) -> Option<BytesMut> {
 
 fn parts(payload: &Payload) -> [&[u8]; 3] {
     [&payload.head, &payload.content, &payload.tail]
+}
+
+/// Reads the identifier that a letter has in the recordings of all hosts.
+pub(in crate::command) fn read_id(json: &[u8]) -> Option<String> {
+    #[derive(Deserialize)]
+    struct IdJson {
+        letter_id: Option<String>,
+    }
+    let read: IdJson = serde_json::from_slice(json.get(..MAX_LETTER.min(json.len()))?).ok()?;
+    read.letter_id
 }
 
 /// A letter of a recording.

@@ -3,9 +3,9 @@
 //! A file comes from outside. The records and the chunks of a file, before and after decompression, have a maximum
 //! length, which is checked before memory is taken. The messages of a chunk are read after its checksum is verified.
 
-use std::borrow::Cow;
 use std::collections::HashMap;
 use std::io::{self, ErrorKind, Read};
+use std::ops::Range;
 
 use mcap::McapError;
 use mcap::records::{Channel, MessageHeader, Metadata, SchemaHeader, op};
@@ -60,62 +60,171 @@ pub(in crate::command) struct End {
 /// # Errors
 /// Fails if the file cannot be read or has another format, or `visit` fails.
 pub(in crate::command) fn read(
-    mut source: impl Read,
+    source: impl Read,
     failed: impl Fn(&RecordingError) -> Failure,
     mut visit: impl FnMut(Item<'_>) -> Result<(), Failure>,
 ) -> Result<End, Failure> {
-    let mut records = LinearReader::new_with_options(
-        LinearReaderOptions::default()
-            .with_skip_end_magic(true)
-            .with_emit_chunks(true)
-            .with_record_length_limit(MAX_RECORD),
-    );
-    let mut known = Known::default();
-    let (mut has_begun, mut is_empty) = (false, true);
-    let end = |is_closed, damage| End { is_closed, damage };
-    loop {
-        let (opcode, data) = match records.next_event() {
-            Some(Ok(LinearReadEvent::ReadRequest(need))) => {
-                let space = records.insert(need.min(PIECE));
-                let read = read_piece(&mut source, space).map_err(|error| failed(&error.into()))?;
-                is_empty &= read == 0;
-                records.notify_read(read);
+    let mut file = FileReader::new(source);
+    while let Some(item) = file.next().map_err(|error| failed(&error))? {
+        visit(item)?;
+    }
+    Ok(file.end())
+}
+
+/// Reads a file item by item. Has one chunk of it in memory.
+pub(in crate::command) struct FileReader<R> {
+    file: LinearReader,
+    source: R,
+    known: Known,
+    /// The records of the last chunk, or the last record outside of a chunk.
+    records: Vec<u8>,
+    /// Position of the next one in `records`.
+    position: usize,
+    has_begun: bool,
+    is_empty: bool,
+    end: Option<End>,
+}
+
+impl<R: Read> FileReader<R> {
+    pub(in crate::command) fn new(source: R) -> Self {
+        Self {
+            file: LinearReader::new_with_options(
+                LinearReaderOptions::default()
+                    .with_skip_end_magic(true)
+                    .with_emit_chunks(true)
+                    .with_record_length_limit(MAX_RECORD),
+            ),
+            source,
+            known: Known::default(),
+            records: Vec::new(),
+            position: 0,
+            has_begun: false,
+            is_empty: true,
+            end: None,
+        }
+    }
+
+    /// Returns the next message or metadata; `None` at the last readable record.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be read or has another format.
+    pub(in crate::command) fn next(&mut self) -> Result<Option<Item<'_>>, RecordingError> {
+        let Some((opcode, place)) = self.advance()? else {
+            return Ok(None);
+        };
+        let data = self.records.get(place).unwrap_or_default();
+        match self.known.item(opcode, data) {
+            Ok(item) => Ok(Some(item)),
+            Err(error) => {
+                self.end = Some(damaged(error));
+                Ok(None)
+            }
+        }
+    }
+
+    /// The end of the file, after its last item.
+    pub(in crate::command) fn end(self) -> End {
+        let open = End {
+            is_closed: false,
+            damage: None,
+        };
+        self.end.unwrap_or(open)
+    }
+
+    /// Moves to the next item. Returns its opcode and its place in `records`; `None` at the end.
+    fn advance(&mut self) -> Result<Option<(u8, Range<usize>)>, RecordingError> {
+        while self.end.is_none() {
+            let mut rest = self.records.get(self.position..).unwrap_or_default();
+            if rest.is_empty() {
+                self.load()?;
                 continue;
             }
-            Some(Ok(LinearReadEvent::Record { data, opcode })) => (opcode, data),
-            None | Some(Err(McapError::UnexpectedEof)) if has_begun => return Ok(end(false, None)),
-            None => return Err(failed(&at_beginning(McapError::UnexpectedEof, is_empty))),
-            Some(Err(error)) if has_begun => return Ok(end(false, Some(error.into()))),
-            Some(Err(error)) => return Err(failed(&at_beginning(error, is_empty))),
-        };
-        has_begun = true;
-        let damage = match opcode {
-            op::FOOTER => return Ok(end(true, None)),
-            op::CHUNK => match unpacked(data) {
-                Ok(chunk) => known.visit_chunk(&chunk, &mut visit)?,
-                Err(error) => Some(error),
-            },
-            _ => known.visit(opcode, data, &mut visit)?,
-        };
-        if damage.is_some() {
-            return Ok(end(false, damage));
+            let Some((opcode, data)) = fields::next_record(&mut rest) else {
+                self.end = Some(damaged(RecordingError::Malformed(op::CHUNK)));
+                break;
+            };
+            let end = self.records.len() - rest.len();
+            self.position = end;
+            if matches!(opcode, op::MESSAGE | op::METADATA) {
+                return Ok(Some((opcode, end - data.len()..end)));
+            }
+            if let Err(error) = self.known.add(opcode, data) {
+                self.end = Some(damaged(error));
+            }
         }
+        Ok(None)
+    }
+
+    /// Reads the next chunk, or the next record outside of a chunk.
+    fn load(&mut self) -> Result<(), RecordingError> {
+        let (opcode, data) = loop {
+            match self.file.next_event() {
+                Some(Ok(LinearReadEvent::ReadRequest(need))) => {
+                    let space = self.file.insert(need.min(PIECE));
+                    let read = read_piece(&mut self.source, space)?;
+                    self.is_empty &= read == 0;
+                    self.file.notify_read(read);
+                }
+                Some(Ok(LinearReadEvent::Record { data, opcode })) => break (opcode, data),
+                None | Some(Err(McapError::UnexpectedEof)) if self.has_begun => {
+                    self.end = Some(End {
+                        is_closed: false,
+                        damage: None,
+                    });
+                    return Ok(());
+                }
+                None => return Err(at_beginning(McapError::UnexpectedEof, self.is_empty)),
+                Some(Err(error)) if self.has_begun => {
+                    self.end = Some(damaged(error.into()));
+                    return Ok(());
+                }
+                Some(Err(error)) => return Err(at_beginning(error, self.is_empty)),
+            }
+        };
+        self.has_begun = true;
+        self.position = 0;
+        match opcode {
+            op::FOOTER => {
+                self.end = Some(End {
+                    is_closed: true,
+                    damage: None,
+                });
+            }
+            op::CHUNK => match unpacked(data) {
+                Ok(records) => self.records = records,
+                Err(error) => self.end = Some(damaged(error)),
+            },
+            // As in a chunk.
+            _ => {
+                self.records.clear();
+                self.records.push(opcode);
+                self.records.extend((data.len() as u64).to_le_bytes());
+                self.records.extend_from_slice(data);
+            }
+        }
+        Ok(())
+    }
+}
+
+fn damaged(error: RecordingError) -> End {
+    End {
+        is_closed: false,
+        damage: Some(error),
     }
 }
 
 /// Returns the records of a chunk. The reader of the crate `mcap` does not check that the records of a chunk end with
 /// it.
-fn unpacked(chunk: &[u8]) -> Result<Cow<'_, [u8]>, RecordingError> {
+fn unpacked(chunk: &[u8]) -> Result<Vec<u8>, RecordingError> {
     let (header, stored) = fields::chunk(chunk).ok_or(RecordingError::Malformed(op::CHUNK))?;
     let records = match header.compression.as_str() {
-        "" => Cow::Borrowed(stored),
+        "" => stored.to_vec(),
         "zstd" if header.uncompressed_size > MAX_RECORD as u64 => {
             return Err(McapError::ChunkTooLarge(header.uncompressed_size).into());
         }
         "zstd" => {
             let unpacked = unpacked_zstd(stored, header.uncompressed_size);
-            let unpacked = unpacked.map_err(|it| McapError::DecompressionError(it.to_string()))?;
-            Cow::Owned(unpacked)
+            unpacked.map_err(|it| McapError::DecompressionError(it.to_string()))?
         }
         _ => return Err(McapError::UnsupportedCompression(header.compression).into()),
     };
@@ -166,51 +275,10 @@ struct Known {
 }
 
 impl Known {
-    /// Visits the item of a record, if it has one. Returns its damage.
-    fn visit(
-        &mut self,
-        opcode: u8,
-        data: &[u8],
-        visit: &mut impl FnMut(Item<'_>) -> Result<(), Failure>,
-    ) -> Result<Option<RecordingError>, Failure> {
-        match self.item(opcode, data) {
-            Ok(Some(item)) => visit(item)?,
-            Ok(None) => {}
-            Err(error) => return Ok(Some(error)),
-        }
-        Ok(None)
-    }
-
-    /// Visits the items of the records of a chunk up to the first damage, and returns it.
-    fn visit_chunk(
-        &mut self,
-        mut records: &[u8],
-        visit: &mut impl FnMut(Item<'_>) -> Result<(), Failure>,
-    ) -> Result<Option<RecordingError>, Failure> {
-        while !records.is_empty() {
-            let Some((opcode, data)) = fields::next_record(&mut records) else {
-                return Ok(Some(RecordingError::Malformed(op::CHUNK)));
-            };
-            let damage = self.visit(opcode, data, visit)?;
-            if damage.is_some() {
-                return Ok(damage);
-            }
-        }
-        Ok(None)
-    }
-
-    /// Returns the item of a record, or `None` if it is none.
-    fn item<'a>(
-        &'a mut self,
-        opcode: u8,
-        data: &'a [u8],
-    ) -> Result<Option<Item<'a>>, RecordingError> {
+    /// Adds a schema or a channel. Other records are not parsed.
+    fn add(&mut self, opcode: u8, data: &[u8]) -> Result<(), RecordingError> {
         let malformed = || RecordingError::Malformed(opcode);
         let len = data.len();
-        if matches!(opcode, op::CHANNEL | op::METADATA) && len > MAX_PAIRS {
-            let len = len as u64;
-            return Err(McapError::RecordTooLarge { opcode, len }.into());
-        }
         match opcode {
             op::SCHEMA => {
                 let (header, text) = fields::schema(data).ok_or_else(malformed)?;
@@ -220,35 +288,38 @@ impl Known {
                     let data = text.to_vec();
                     self.schemas.insert(header.id, FileSchema { header, data });
                 }
-                Ok(None)
             }
             op::CHANNEL => {
+                check_pairs(opcode, len)?;
                 let channel = fields::channel(data).ok_or_else(malformed)?;
                 if !self.channels.contains_key(&channel.id) {
                     self.count(len.saturating_add(channel.metadata.len() * PAIR))?;
                     self.channels.insert(channel.id, channel);
                 }
-                Ok(None)
             }
-            op::MESSAGE => {
-                let (header, data) = fields::message(data).ok_or_else(malformed)?;
-                let id = header.channel_id;
-                let channel = self.channels.get(&id);
-                let channel = channel.ok_or(RecordingError::UnknownChannel(id))?;
-                Ok(Some(Item::Message {
-                    channel,
-                    schema: self.schemas.get(&channel.schema_id),
-                    header,
-                    data,
-                }))
-            }
-            op::METADATA => {
-                let metadata = fields::metadata(data).ok_or_else(malformed)?;
-                Ok(Some(Item::Metadata(metadata)))
-            }
-            // Other records are not parsed.
-            _ => Ok(None),
+            _ => {}
         }
+        Ok(())
+    }
+
+    /// Returns the item of a record, a message or metadata.
+    fn item<'a>(&'a self, opcode: u8, data: &'a [u8]) -> Result<Item<'a>, RecordingError> {
+        let malformed = || RecordingError::Malformed(opcode);
+        if opcode == op::METADATA {
+            check_pairs(opcode, data.len())?;
+            let metadata = fields::metadata(data).ok_or_else(malformed)?;
+            return Ok(Item::Metadata(metadata));
+        }
+        let (header, data) = fields::message(data).ok_or_else(malformed)?;
+        let id = header.channel_id;
+        let channel = self.channels.get(&id);
+        let channel = channel.ok_or(RecordingError::UnknownChannel(id))?;
+        Ok(Item::Message {
+            channel,
+            schema: self.schemas.get(&channel.schema_id),
+            header,
+            data,
+        })
     }
 
     fn count(&mut self, bytes: usize) -> Result<(), RecordingError> {
@@ -257,6 +328,17 @@ impl Known {
             true => Err(RecordingError::TooManyChannels(MAX_CHANNELS)),
             false => Ok(()),
         }
+    }
+}
+
+/// Checks the length of a record with pairs of texts.
+fn check_pairs(opcode: u8, len: usize) -> Result<(), RecordingError> {
+    match len > MAX_PAIRS {
+        true => {
+            let len = len as u64;
+            Err(McapError::RecordTooLarge { opcode, len }.into())
+        }
+        false => Ok(()),
     }
 }
 

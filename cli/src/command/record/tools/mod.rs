@@ -3,6 +3,7 @@
 pub(super) mod copy;
 mod found;
 pub(super) mod info;
+pub(super) mod merge;
 mod select;
 pub(super) mod to_json;
 
@@ -21,6 +22,12 @@ pub(in crate::command) fn read_file(
     visit: impl FnMut(Item<'_>) -> Result<(), Failure>,
 ) -> Result<End, Failure> {
     let end = read_quietly(path, visit)?;
+    warn_if_open(path, &end);
+    Ok(end)
+}
+
+/// Warns of a file that was not closed.
+fn warn_if_open(path: &Path, end: &End) {
     if !end.is_closed {
         let name = input::name(path);
         report::warn(&match &end.damage {
@@ -34,7 +41,6 @@ pub(in crate::command) fn read_file(
             ),
         });
     }
-    Ok(end)
 }
 
 /// Reads a recording, without a warning.

@@ -30,7 +30,7 @@ Examples:
 
 JSON, one object on a line:
   { \"topic\", \"time\": RFC 3339 with milliseconds, \"nanoseconds\": since 1970-01-01T00:00:00Z,
-    \"message\": if it is JSON, or \"base64\" }")]
+    \"host\": of a merged file, \"message\": if it is JSON, or \"base64\" }")]
 pub(in crate::command) struct Arguments {
     /// Recording; - for standard input
     file: PathBuf,
@@ -71,6 +71,10 @@ pub(in crate::command::record) fn run(arguments: &Arguments) -> Result<(), Failu
         let mut line = json!({
             "topic": channel.topic, "time": rfc3339(at), "nanoseconds": header.publish_time,
         });
+        // A merged file has the host of each channel.
+        if let Some(host) = channel.metadata.get("host") {
+            line["host"] = host.as_str().into();
+        }
         let message = match channel.message_encoding.as_str() {
             file::JSON => serde_json::from_slice::<Value>(data).ok(),
             _ => None,
