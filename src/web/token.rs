@@ -62,6 +62,16 @@ pub enum TokenError {
     },
 }
 
+/// Returns a new secret of 128 bits, as hexadecimal digits.
+pub(super) fn random_text() -> io::Result<String> {
+    let mut bytes = [0; RANDOM];
+    getrandom::fill(&mut bytes).map_err(io::Error::other)?;
+    Ok(bytes.iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    }))
+}
+
 impl Token {
     /// Reads the token in a file, or creates the file with a new one, which only its owner may read.
     pub(crate) fn load(path: &Path) -> Result<Self, TokenError> {
@@ -103,12 +113,7 @@ impl Token {
     }
 
     fn create(path: &Path) -> io::Result<Self> {
-        let mut bytes = [0; RANDOM];
-        getrandom::fill(&mut bytes).map_err(io::Error::other)?;
-        let token = bytes.iter().fold(String::new(), |mut text, byte| {
-            let _ = write!(text, "{byte:02x}");
-            text
-        });
+        let token = random_text()?;
         let new = File::options()
             .write(true)
             .create_new(true)

@@ -2,11 +2,13 @@
 
 use clap::Args;
 use fipa::admin::keys::{Certificate, Keys};
+use fipa::admin::routes::HttpListener;
 use fipa::config::{ConfigError, Reloaded};
 use fipa::{Config, Gateway, log_limit};
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
 
+use super::dashboard::Dashboard;
 use crate::membership::{self, SignalRequest, Stop};
 use crate::options::{self, Global};
 use crate::output;
@@ -57,7 +59,8 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let opened = Gateway::open(config).await;
+    let (dashboard, pages) = Dashboard::start(config);
+    let opened = Gateway::open_with_pages(config, pages).await;
     let mut gateway = opened.map_err(|error| membership::not_joined(error, config))?;
     let mut problems = gateway.discovery_problem();
     let mut problem = problems.borrow_and_update().clone();
@@ -101,6 +104,7 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
         watchdog.abort();
     }
     Stop::ending();
+    dashboard.close().await;
     gateway.close().await;
     Ok(())
 }
@@ -128,11 +132,16 @@ fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
     for location in gateway.locations() {
         text.push_str(&format!("  listening on {location}\n"));
     }
-    if let Some(address) = gateway.web_address() {
-        let token = gateway.web_token_file();
-        let token = escape(&token.to_string_lossy()).into_owned();
+    if let Some(HttpListener {
+        address,
+        token_file,
+        ..
+    }) = gateway.http()
+    {
+        let token = escape(token_file);
         text.push_str(&format!(
-            "  metrics at http://{address}/metrics, with the token in {token}\n"
+            "  metrics at http://{address}/metrics, with the token in {token}\n  \
+               dashboard: run `fipa dashboard` for its link\n"
         ));
     }
     text.push_str(&format!("  other hosts: {}\n", trusted_hosts(config)));
@@ -191,10 +200,7 @@ fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Valu
         "incarnation": gateway.incarnation(),
         "domain": config.domain,
         "locations": locations.collect::<Vec<_>>(),
-        "http": gateway.web_address().map(|address| json!({
-            "address": address.to_string(),
-            "token_file": gateway.web_token_file().to_string_lossy(),
-        })),
+        "http": gateway.http(),
         "discovery": discovery,
         "security": {
             "encrypted": !config.security.keys.is_empty(),
