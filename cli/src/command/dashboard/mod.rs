@@ -151,8 +151,9 @@ fn open_browser(config: &Config, link: &str) -> Result<(), Failure> {
     }
 }
 
-/// The dashboard of a gateway. Ends when it is dropped.
+/// The dashboard of a gateway.
 pub(super) struct Dashboard {
+    observation: Arc<Observation>,
     observing: JoinHandle<()>,
 }
 
@@ -162,19 +163,18 @@ impl Dashboard {
     pub(super) fn start(config: &Config) -> (Self, Pages) {
         let observation = Observation::new();
         let pages = pages::pages(Arc::clone(&observation));
-        let observing = tokio::spawn(observation::run(observation, config.clone()));
-        (Self { observing }, pages)
+        let observing = tokio::spawn(observation::run(Arc::clone(&observation), config.clone()));
+        let dashboard = Self {
+            observation,
+            observing,
+        };
+        (dashboard, pages)
     }
 
     /// Stops observing the domain, and leaves it.
-    pub(super) async fn close(mut self) {
-        self.observing.abort();
-        let _ = (&mut self.observing).await;
-    }
-}
-
-impl Drop for Dashboard {
-    fn drop(&mut self) {
-        self.observing.abort();
+    pub(super) async fn close(self) {
+        self.observation.stop();
+        // A panic of the task has been reported.
+        let _ = self.observing.await;
     }
 }

@@ -38,6 +38,8 @@ pub(super) struct Observation {
     picture: Mutex<Picture>,
     /// Wakes the task that observes.
     wanted: Notify,
+    /// Ends the task that observes.
+    stopped: Notify,
     last: Mutex<Instant>,
     last_locks: Mutex<Instant>,
 }
@@ -48,9 +50,15 @@ impl Observation {
         Arc::new(Self {
             picture: Mutex::default(),
             wanted: Notify::new(),
+            stopped: Notify::new(),
             last: Mutex::new(now),
             last_locks: Mutex::new(now),
         })
+    }
+
+    /// Ends the task that observes.
+    pub(super) fn stop(&self) {
+        self.stopped.notify_one();
     }
 
     /// Returns a view, and keeps the domain observed.
@@ -65,21 +73,32 @@ impl Observation {
     }
 }
 
-/// Observes the domain whenever pages show it, until it is aborted.
+/// Observes the domain whenever pages show it, until it is stopped.
 pub(super) async fn run(observation: Arc<Observation>, config: Config) {
-    loop {
-        observation.wanted.notified().await;
-        if let Err(failure) = observe(&observation, &config).await {
-            observation.picture.lock().fail(failure.problem());
-            tokio::time::sleep(RETRY).await;
-        } else {
-            *observation.picture.lock() = Picture::default();
-        }
+    let mut is_stopped = false;
+    while !is_stopped {
+        is_stopped = tokio::select! {
+            () = observation.stopped.notified() => true,
+            () = observation.wanted.notified() => {
+                let observed = observe(&observation, &config).await;
+                match observed {
+                    Ok(is_stopped) => {
+                        *observation.picture.lock() = Picture::default();
+                        is_stopped
+                    }
+                    Err(failure) => {
+                        observation.picture.lock().fail(failure.problem());
+                        let stopped = observation.stopped.notified();
+                        tokio::time::timeout(RETRY, stopped).await.is_ok()
+                    }
+                }
+            }
+        };
     }
 }
 
-/// Observes the domain until no page has shown it for a while.
-async fn observe(observation: &Observation, config: &Config) -> Result<(), Failure> {
+/// Observes the domain until no page has shown it for a while. Returns whether the task has been stopped.
+async fn observe(observation: &Observation, config: &Config) -> Result<bool, Failure> {
     let library = checker::protocols(&config.monitor.protocols, None)?;
     let domain = membership::join_briefly(config).await?;
     let observed = follow(observation, config, &domain, Checker::new(library)).await;
@@ -92,7 +111,7 @@ async fn follow(
     config: &Config,
     domain: &Domain,
     checker: Checker,
-) -> Result<(), Failure> {
+) -> Result<bool, Failure> {
     let asker = membership::asker(domain).await?;
     let locks_asker = register(domain, config).await?;
     let own = vec![asker.name().to_owned(), locks_asker.name().to_owned()];
@@ -123,12 +142,13 @@ async fn follow(
             }
         }
     };
-    tokio::select! {
-        () = watching => {}
-        () = top::ask(asker, sender) => {}
-        () = ask_for_locks(observation, &locks_asker, locks_sender) => {}
-    }
-    Ok(())
+    let is_stopped = tokio::select! {
+        () = watching => false,
+        () = top::ask(asker, sender) => false,
+        () = ask_for_locks(observation, &locks_asker, locks_sender) => false,
+        () = observation.stopped.notified() => true,
+    };
+    Ok(is_stopped)
 }
 
 async fn register(domain: &Domain, config: &Config) -> Result<Agent, Failure> {

@@ -100,7 +100,7 @@ export function conversation(id) {
       element('dt', {}, title), element('dd', { class: isBad ? 'bad-text' : null }, String(value)))));
     const violations = all.filter((letter) => letter.violation);
     found.replaceChildren(...violations.map((letter) => element('p', { class: 'bad-text' },
-      `${clock(letter.time)} ${letter.from} to ${letter.to}: ${letter.violation}`)));
+      `${clock(letter.time)}: ${letter.violation}`)));
     diagram.replaceChildren(sequence(all));
     letters.show(sections.letters ?? {});
   };

@@ -19,13 +19,13 @@ function outcome(fate) {
 function letterRow(row) {
   const way = [row.via, row.gateway ? `gateway ${row.gateway}` : null].filter(Boolean).join(', ');
   return element('tr', { class: row.violation || row.fate.outcome === 'failed' ? 'bad' : null },
-    element('td', {}, clock(row.time)),
+    element('td', { class: 'short' }, clock(row.time)),
     element('td', {}, link('agent', row.from)), element('td', {}, link('agent', row.to)),
     element('td', {}, row.performative, row.protocol ? element('span', { class: 'faint' }, ` ${row.protocol}`) : null,
       row.conversation ? element('div', {}, link('conversation', row.conversation)) : null,
       row.violation ? element('div', { class: 'bad-text' }, row.violation) : null),
     element('td', { class: 'optional' }, way, element('div', { class: 'faint' }, `${row.size} bytes`)),
-    element('td', {}, outcome(row.fate)));
+    element('td', { class: row.fate.reason ? null : 'short' }, outcome(row.fate)));
 }
 
 /** A table of letters, the newest first or, for a conversation, in order. */
