@@ -71,6 +71,22 @@
 //! the changes, and [`Domain::directory`] looks up and searches. [`Agent::df`] registers and finds
 //! services with the directory facilitator of a gateway ([`platform`]).
 //!
+//! # Traces
+//!
+//! With the feature `opentelemetry`, a letter that is sent in a span of [OpenTelemetry](https://docs.rs/opentelemetry)
+//! carries the identity of the span in its envelope (W3C Trace Context). [`Incoming::trace_context`] and
+//! [`protocol::Task::trace_context`] return it, so that the receiver can start a child of the span.
+//! Messages of calls such as [`Agent::request`] are letters, too. Without a span, nothing is added.
+//!
+//! The span is that of `opentelemetry::Context::current()` when the letter is sent: at the call of [`Agent::send`] or
+//! [`Agent::send_loan`], before its future is polled, and while the futures of other calls are polled. It is current for
+//! both in an `async` block that `opentelemetry::context::FutureExt::with_context` or `tracing::Instrument::instrument`
+//! wraps. An entered span of the crate `tracing` is current if the subscriber has the layer of `tracing-opentelemetry`,
+//! without `with_context_activation(false)`, and no filter disables the span for this layer.
+//!
+//! The program has to use the version of `opentelemetry` that this crate uses (0.33), and `tracing-opentelemetry` 0.34:
+//! each minor version of `opentelemetry` has a current context of its own.
+//!
 //! # Configure
 //!
 //! [`Domain::from_environment`] reads the file named by `$FIPA_CONFIG`, else `./fipa.toml`, else
@@ -96,6 +112,14 @@
     doc = "[`actions`]: https://docs.rs/fipa/latest/fipa/actions/index.html"
 )]
 #![cfg_attr(
+    not(feature = "opentelemetry"),
+    doc = "[`Incoming::trace_context`]: https://docs.rs/fipa/latest/fipa/struct.Incoming.html#method.trace_context"
+)]
+#![cfg_attr(
+    not(feature = "opentelemetry"),
+    doc = "[`protocol::Task::trace_context`]: https://docs.rs/fipa/latest/fipa/protocol/struct.Task.html"
+)]
+#![cfg_attr(
     not(feature = "net"),
     doc = "[`Gateway`]: https://docs.rs/fipa/latest/fipa/struct.Gateway.html"
 )]
@@ -111,7 +135,7 @@ pub mod blocking;
 pub mod coalitions;
 pub mod config;
 mod domain;
-#[cfg(any(feature = "protocols", feature = "secure"))]
+#[cfg(any(feature = "protocols", feature = "secure", feature = "web"))]
 mod durable;
 pub mod error;
 #[cfg(feature = "fuzzing")]

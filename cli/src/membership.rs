@@ -11,7 +11,7 @@ use fipa::admin::contact;
 use fipa::admin::routes::{self, AskError, RouteReport};
 use fipa::admin::stopped::StoppedAgent;
 use fipa::config::{ConfigError, Reloaded};
-use fipa::error::{DomainDirError, ErrorChain, ListenError, OpenError, RegisterError};
+use fipa::error::{DomainDirError, ErrorChain, ListenError, OpenError, RegisterError, WebError};
 use fipa::threads::ThreadError;
 use fipa::{
     Agent, AgentId, Config, Domain, Entry, Incarnation, Reach, RegisterOptions, Role, log_limit,
@@ -186,6 +186,7 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
                 advice,
             )
         }
+        OpenError::Web(error) => not_served(&error),
         OpenError::Keys(_) => Failure::failed(
             ErrorChain(&error).to_string(),
             format!("mts.name {:?}", config.mts.name),
@@ -226,6 +227,30 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
              not set: the processes of a domain meet there",
         ),
     }
+}
+
+/// The error report for a gateway that cannot answer HTTP.
+fn not_served(error: &WebError) -> Failure {
+    let (key, advice) = match error {
+        WebError::Listen { source, .. } if source.kind() == io::ErrorKind::AddrInUse => (
+            "http.listen",
+            "`ss -ltnp` lists the process that uses the port",
+        ),
+        WebError::Listen { .. } => (
+            "http.listen",
+            "use a loopback address of this machine and a port that this user may open",
+        ),
+        _ => (
+            "http.token_file",
+            "give a file in a directory to which only the user of the gateway can write; if it is missing, the \
+             gateway creates it",
+        ),
+    };
+    Failure::failed(
+        ErrorChain(error).to_string(),
+        format!("{key} of the configuration"),
+        advice,
+    )
 }
 
 /// The error report for a directory of the domain in which no file can be written.

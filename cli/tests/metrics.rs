@@ -11,6 +11,10 @@ use std::net::{SocketAddr, TcpStream};
 use std::time::Duration;
 
 use common::{Host, Running};
+use fipa::blocking::Wait;
+use fipa::config::Sources;
+use fipa::{Agent, Config, Domain, Kind, Message, Performative};
+use fipa_testbed::until;
 use serde_json::Value;
 
 /// Timeout for hanging tests.
@@ -21,21 +25,27 @@ const MAX_SERIES: usize = 200;
 
 /// A gateway that shows metrics.
 struct Shown {
-    _gateway: Running,
+    gateway: Running,
     address: SocketAddr,
     token: String,
 }
 
 impl Shown {
     fn start(host: &Host, listen: &str) -> Self {
+        Self::start_with(host, listen, &[])
+    }
+
+    fn start_with(host: &Host, listen: &str, settings: &[&str]) -> Self {
         let listen = format!("http.listen={listen}");
-        let names = "http.names=[\"rover.example\"]";
-        let arguments = ["up", "--json", "--set", &listen, "--set", names];
+        let own = [&*listen, "http.names=[\"rover.example\"]"];
+        let settings = own.iter().chain(settings);
+        let settings = settings.flat_map(|setting| ["--set", setting]);
+        let arguments: Vec<_> = ["up", "--json"].into_iter().chain(settings).collect();
         let gateway = host.start(&arguments);
         let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
         let file = ready["http"]["token_file"].as_str().unwrap();
         Self {
-            _gateway: gateway,
+            gateway,
             address: ready["http"]["address"].as_str().unwrap().parse().unwrap(),
             token: fs::read_to_string(file).unwrap().trim_end().to_owned(),
         }
@@ -63,6 +73,13 @@ impl Shown {
             "Host: {}\r\nAuthorization: Bearer {}\r\n",
             self.address, self.token
         )
+    }
+
+    /// Waits until a series has this value.
+    #[track_caller]
+    fn until(&self, series: &str, value: f64) {
+        let what = format!("{series} is {value}");
+        until(&what, || self.values()[series] == value);
     }
 
     /// The values by their series.
@@ -175,6 +192,102 @@ fn violations_are_counted_by_protocol() {
     assert_eq!(status, 200);
 }
 
+/// Joins the domain of a host with this process.
+fn join(host: &Host) -> Domain {
+    let mut sources = Sources::default();
+    let directory = host.path("run");
+    sources.set = vec![
+        format!("domain={}", host.domain),
+        format!("runtime_dir={}", directory.display()),
+        "discovery.mdns=false".to_owned(),
+    ];
+    let config = Config::load(&sources).unwrap();
+    Domain::open(&config).wait().unwrap()
+}
+
+fn inform(from: &Agent, to: &str) -> Message {
+    let message = from.message(Performative::Inform).receiver(to);
+    message.content("text").build().unwrap()
+}
+
+const QUEUED: &str = "fipa_letters_queued";
+const UNDER_WAY: &str = "fipa_letters_under_way";
+
+/// Sends letters to an agent that does not read, and then reads two of five.
+#[track_caller]
+fn letters_wait(from: &Agent, to: &Agent, over: Kind, shown: &Shown) {
+    shown.until(QUEUED, 0.0);
+    for number in 1..=5 {
+        let sent = from.send(inform(from, to.name())).wait().unwrap();
+        assert_eq!(sent.0[0].outcome.via(), Some(over), "{sent}");
+        shown.until(QUEUED, f64::from(number));
+    }
+    for left in [4, 3] {
+        to.receive_within(WATCHDOG).wait().unwrap().unwrap();
+        shown.until(QUEUED, f64::from(left));
+    }
+}
+
+#[test]
+fn letters_that_an_agent_does_not_read_are_queued_until_it_reads_or_ends() {
+    let host = Host::new();
+    let shown = Shown::start(&host, "127.0.0.1:0");
+    let (one, other) = (join(&host), join(&host));
+    let rover = one.register("rover").wait().unwrap();
+    let arm = other.register("arm").wait().unwrap();
+    letters_wait(&rover, &arm, Kind::Shm, &shown);
+    assert_eq!(arm.deregister().unwrap().len(), 3);
+    shown.until(QUEUED, 0.0);
+    one.close().wait();
+    other.close().wait();
+}
+
+/// Two hosts whose gateways are connected over TCP at this address.
+fn letters_wait_at_another_host(address: &str) {
+    let (near, far) = (Host::new(), Host::new());
+    let listen = format!("transport.tcp.listen=[\"{address}:0\"]");
+    let named = |name: &str| format!("mts.name={name}-{}", near.domain);
+    let far_shown = Shown::start_with(&far, "127.0.0.1:0", &[&listen, &named("far")]);
+    let at = far_shown.gateway.tcp_address();
+    let knows = format!("discovery.static={{ far = [\"tcp://{at}\"] }}");
+    let settings = [&*listen, &knows, &named("near")];
+    let near_shown = Shown::start_with(&near, "127.0.0.1:0", &settings);
+    let (here, there) = (join(&near), join(&far));
+    let rover = here.register("rover").wait().unwrap();
+    let arm = there.register("arm").wait().unwrap();
+    until("the arm is known", || {
+        here.directory().known("arm").is_some()
+    });
+    letters_wait(&rover, &arm, Kind::Tcp, &far_shown);
+    near_shown.until(QUEUED, 0.0);
+
+    // The other host is silent: the letter has no outcome, and waits on this one.
+    near_shown.until(UNDER_WAY, 0.0);
+    far_shown.gateway.send_signal("-STOP");
+    let sent = rover.send_within(inform(&rover, "arm"), WATCHDOG);
+    // The gateways write letters to each other, too.
+    assert!(near_shown.values()[UNDER_WAY] >= 1.0);
+    far_shown.gateway.send_signal("-CONT");
+    let sent = sent.wait().unwrap();
+    assert!(sent.all_succeeded(), "{sent}");
+    near_shown.until(UNDER_WAY, 0.0);
+    far_shown.until(QUEUED, 4.0);
+    // The letters that are not read end with their agent.
+    there.close().wait();
+    far_shown.until(QUEUED, 0.0);
+    here.close().wait();
+}
+
+#[test]
+fn letters_for_another_host_are_queued_there_or_under_way_here_over_ipv4() {
+    letters_wait_at_another_host("127.0.0.1");
+}
+
+#[test]
+fn letters_for_another_host_are_queued_there_or_under_way_here_over_ipv6() {
+    letters_wait_at_another_host("[::1]");
+}
+
 /// The number of times that the threads of a process have waited.
 fn waits(pid: &str) -> u64 {
     let tasks = fs::read_dir(format!("/proc/{pid}/task")).unwrap();
@@ -238,6 +351,18 @@ fn requests_without_the_token_or_under_another_name_are_refused() {
     }
     let (status, _) = shown.ask("/other", &shown.admitted());
     assert_eq!(status, 404);
+    // A whole URI in the first line.
+    for (host, expected) in [("evil.example", 421), ("localhost:80", 200)] {
+        let path = format!("http://{host}/metrics");
+        assert_eq!(shown.ask(&path, &shown.admitted()).0, expected, "{host}");
+    }
+    // A client that closes its side after the request.
+    let mut stream = shown.connect();
+    write!(stream, "GET /metrics HTTP/1.1\r\n{}\r\n", shown.admitted()).unwrap();
+    stream.shutdown(std::net::Shutdown::Write).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    assert!(answer.starts_with("HTTP/1.1 200 "), "{answer}");
     let long = format!("{own}{token}X: {}\r\n", "x".repeat(20_000));
     let mut stream = shown.connect();
     // The gateway may close the connection before it has read all.
@@ -273,4 +398,15 @@ fn a_wrong_configuration_is_explained() {
         .run(&["up", "--set", listen, "--set", &file])
         .failed_text();
     assert!(error.contains("chmod 600"), "{error}");
+    // No advice to change or delete a device.
+    let file = "http.token_file=/dev/zero";
+    let (_, error) = host
+        .run(&["up", "--set", listen, "--set", file])
+        .failed_text();
+    let is_named = error.contains("regular file") && error.contains("http.token_file");
+    assert!(is_named && !error.contains("delete"), "{error}");
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let listen = format!("http.listen={}", taken.local_addr().unwrap());
+    let (_, error) = host.run(&["up", "--set", &listen]).failed_text();
+    assert!(error.contains("ss -ltnp"), "{error}");
 }

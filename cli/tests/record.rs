@@ -3,6 +3,9 @@
 #![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
+#[path = "common/mcap_file.rs"]
+#[allow(dead_code, reason = "not all items are used here")]
+mod mcap_file;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,6 +14,7 @@ use std::process::Command;
 use common::{Host, Ran, Running};
 use fastrand::Rng;
 use fipa_testbed::languages::mcap_python;
+use mcap_file::{Compression, rechunked};
 use serde_json::{Value, json};
 
 /// Starts `fipa record --json` and waits until it records all running processes.
@@ -212,7 +216,39 @@ fn a_recording_is_filtered() {
     let before = fs::read(&filtered).unwrap();
     let again = host.run(&["record", "-o", text(&filtered)]).failed(1);
     assert!(again.contains("give another name"), "{again}");
+    // Standard output takes no recording, and no file gets the name `-`.
+    for command in [&["record"][..], &["record", "repair", text(&file)]] {
+        let refused = host.run(&[command, &["-o", "-"]].concat()).failed(2);
+        assert!(refused.contains("standard output"), "{refused}");
+    }
     assert_eq!(fs::read(&filtered).unwrap(), before);
+}
+
+/// The channel of one agent can have the name of the channel with the bytes of another one.
+#[test]
+fn the_name_of_a_receiver_hides_no_letters() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let _agents = ["arm_1", "arm_1/raw", "raw"].map(|name| host.echo(name));
+    let recording = record(&host, &["-o", text(&file)]);
+    send(&host, "send arm_1 first");
+    send(&host, "send arm_1/raw second");
+    send(&host, "send raw third");
+    // Empty content, whose bytes are recorded, too.
+    host.run(&["send", "raw", ""]).done();
+    end(recording);
+    let all = messages(&host, &file, &["--raw"]);
+    let contents: Vec<&Value> = letters(&all)
+        .iter()
+        .map(|it| &it["letter"]["message"]["content"])
+        .collect();
+    assert_eq!(contents, ["first", "second", "third", ""]);
+    let bytes = all.iter().filter(|it| it["base64"].is_string());
+    assert_eq!(bytes.count(), 4);
+    let checked = host
+        .run(&["replay", text(&file), "--check", "--json"])
+        .done_json();
+    assert_eq!(checked["letters"], 4, "{checked}");
 }
 
 #[test]
@@ -375,6 +411,51 @@ fn hostile_files_are_refused_within_a_limit_of_memory() {
     }
 }
 
+#[test]
+fn files_with_changed_records_and_valid_checksums_end_no_command() {
+    let host = Host::new();
+    let path = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    let recording = record(&host, &["-o", text(&path)]);
+    say(&host, "inform", "fipa-request", "c1", "x");
+    say(&host, "request", "none", "c2", "x");
+    end(recording);
+    let file = fs::read(&path).unwrap();
+    let mut random = Rng::with_seed(5);
+    let (changed, copy) = (host.path("changed.mcap"), host.path("copy.mcap"));
+    let (changed, to) = (text(&changed), text(&copy));
+    let commands: [&[&str]; 5] = [
+        &["record", "info", changed],
+        &["record", "to-json", changed, "--agent", "arm_1"],
+        &["record", "repair", changed, "-o", to],
+        &["record", "filter", changed, "-o", to, "--violations"],
+        &["replay", changed, "--check"],
+    ];
+    for number in 0..60 {
+        let bytes = rechunked(&file, Compression::None, |records| {
+            for _ in 0..random.usize(1..6) {
+                let at = random.usize(..records.len());
+                // Digits and quotes are in the lengths, the times and the JSON.
+                let byte = [random.u8(..), b'9', b'"', b'-', 0, 0xff];
+                records[at] = random.choice(byte).unwrap();
+            }
+        });
+        fs::write(changed, &bytes).unwrap();
+        let command = commands[number % commands.len()];
+        let ran = host.run(command);
+        assert!(
+            matches!(ran.code, Some(0 | 1)),
+            "{number} {command:?}: {ran:?}"
+        );
+        assert!(
+            !ran.stderr.contains("panicked"),
+            "{number} {command:?}: {ran:?}"
+        );
+        // A command that reads no record makes no copy.
+        let _ = fs::remove_file(&copy);
+    }
+}
+
 /// A chunk of zeros in blocks of zstd, each of which is one byte that is repeated (RFC 8878 3.1.1.2).
 fn bomb(announced: u64, has_checksum: bool) -> Vec<u8> {
     let mut zstd = vec![0x28, 0xb5, 0x2f, 0xfd, 0x00, 0x58];
@@ -414,6 +495,11 @@ fn a_recording_is_split_and_the_oldest_files_are_deleted() {
         "--keep",
         "3",
     ];
+    // Other files with similar names.
+    let others = ["run_20260301.mcap", "run_001.mcap", "run_00001.mcap"];
+    for other in others {
+        fs::write(host.path(other), "").unwrap();
+    }
     let recording = record(&host, &options);
     send(
         &host,
@@ -425,7 +511,8 @@ fn a_recording_is_split_and_the_oldest_files_are_deleted() {
     let files = || {
         let entries = fs::read_dir(path.parent().unwrap()).unwrap();
         let names = entries.map(|it| it.unwrap().file_name().into_string().unwrap());
-        let mut names: Vec<String> = names.filter(|it| it.starts_with("run_")).collect();
+        let is_part = |it: &String| it.starts_with("run_") && !others.contains(&&**it);
+        let mut names: Vec<String> = names.filter(is_part).collect();
         names.sort_unstable();
         names
     };
@@ -457,6 +544,33 @@ fn a_recording_is_split_and_the_oldest_files_are_deleted() {
     // Another recording continues.
     end(record(&host, &options));
     assert_eq!(files().last(), Some(&format!("run_{made:04}.mcap")));
+    for other in others {
+        assert!(host.path(other).exists(), "{other} was deleted");
+    }
+}
+
+#[test]
+fn a_recording_goes_on_after_its_file_is_removed() {
+    let host = Host::new();
+    let file = host.path("run.mcap");
+    let _arm = host.echo("arm_1");
+    let mut recording = record(&host, &["-o", text(&file), "--sync", "10ms"]);
+    send(&host, "send arm_1 before");
+    fs::remove_file(&file).unwrap();
+    fipa_testbed::until("there is another file", || file.exists());
+    send(&host, "send arm_1 after");
+    recording.send_signal("-TERM");
+    let summary: Value = serde_json::from_str(&recording.line()).unwrap();
+    assert_eq!(summary["files"], 2, "{summary}");
+    let (code, errors) = recording.end();
+    assert_eq!(code, Some(0));
+    assert!(errors.contains("was removed"), "{errors}");
+    let all = messages(&host, &file, &[]);
+    let contents: Vec<&Value> = letters(&all)
+        .iter()
+        .map(|it| &it["letter"]["message"]["content"])
+        .collect();
+    assert_eq!(contents.last().copied(), Some(&json!("after")), "{all:#?}");
 }
 
 #[test]

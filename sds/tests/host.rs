@@ -19,6 +19,7 @@ use fipa_sds::{
     RegisterError, Role, Source,
 };
 use fipa_testbed::{ChildGuard, until_some_async};
+use fipa_transport::counts::{Counts, Direction, LetterOutcome, Totals};
 use fipa_transport::{DirectoryError, DomainUsers, Incarnation};
 
 fn config(dir: &Path) -> HostConfig {
@@ -580,6 +581,102 @@ async fn planted_files_are_rejected_and_links_not_followed() {
     assert_eq!(other.ask("register leg"), "ok");
     assert!(directory.lookup("leg").is_some());
     assert_eq!(std::fs::read_to_string(&precious).unwrap(), good);
+}
+
+/// Counters of a process that has sent a letter.
+fn counted() -> Totals {
+    let counts = Counts::default();
+    counts.letter(Direction::Sent, None, LetterOutcome::Failed);
+    counts.totals()
+}
+
+fn twice(values: &Totals) -> Totals {
+    let mut sum = values.clone();
+    sum.add(values);
+    sum
+}
+
+#[tokio::test]
+async fn planted_counters_keep_no_process_from_joining_and_are_not_counted() {
+    let (parent, dir) = fresh_dir();
+    let directory = open(&dir);
+    let values = counted();
+    drop(directory.create_counts(&values).unwrap());
+    let precious = parent.path().join("precious");
+    std::fs::write(&precious, values.to_page()).unwrap();
+    symlink(&precious, dir.join("0000000000000001.counts")).unwrap();
+    symlink(&precious, dir.join("ended.counts")).unwrap();
+    std::fs::create_dir(dir.join("0000000000000002.counts")).unwrap();
+    let (fifo, fifo_type) = (
+        dir.join("0000000000000003.counts"),
+        rustix::fs::FileType::Fifo,
+    );
+    rustix::fs::mknodat(rustix::fs::CWD, fifo, fifo_type, rustix::fs::Mode::RWXU, 0).unwrap();
+    std::fs::write(dir.join("0000000000000004.counts"), [0xff; 100]).unwrap();
+
+    let sums = directory.sum_counts().unwrap();
+    assert_eq!(
+        (sums.running, sums.ended),
+        (values.clone(), Totals::default())
+    );
+    let newcomer = open(&dir);
+    drop(newcomer.create_counts(&values).unwrap());
+    let sums = directory.sum_counts().unwrap();
+    assert_eq!(sums.running, twice(&values));
+    drop(newcomer);
+    let sums = directory.sum_counts().unwrap();
+    assert_eq!((&sums.running, &sums.ended), (&values, &values));
+    let planted = files(&dir)
+        .into_iter()
+        .filter(|name| name.starts_with("000000000000000"));
+    assert_eq!(planted.collect::<Vec<_>>(), ["0000000000000002.counts"]);
+    assert_eq!(std::fs::read(&precious).unwrap(), values.to_page());
+}
+
+#[test]
+fn counters_of_an_ended_process_survive_a_full_disk() {
+    fipa_testbed::isolated(
+        "inside_counters_of_an_ended_process_survive_a_full_disk",
+        &[],
+    );
+}
+
+#[tokio::test]
+#[ignore = "is run by the other test in namespaces of its own"]
+async fn inside_counters_of_an_ended_process_survive_a_full_disk() {
+    fipa_testbed::enter();
+    let disk = fipa_testbed::directory().join("disk");
+    std::fs::create_dir(&disk).unwrap();
+    fipa_testbed::run(&format!(
+        "mount -t tmpfs -o size=256k,mode=0700 tmpfs {}",
+        disk.display()
+    ));
+    let dir = disk.join("domain");
+    let directory = open(&dir);
+    let values = counted();
+    drop(directory.create_counts(&values).unwrap());
+    let other = open(&dir);
+    drop(other.create_counts(&values).unwrap());
+    let mut filler = std::fs::File::create(disk.join("filler")).unwrap();
+    while filler.write_all(&[0; 512]).is_ok() {}
+
+    drop(other);
+    let all = || {
+        let sums = directory.sum_counts().unwrap();
+        let mut all = sums.running;
+        all.add(&sums.ended);
+        all
+    };
+    assert_eq!(all(), twice(&values));
+    // A process that joins does not need the space, either.
+    drop(open(&dir));
+    assert_eq!(all(), twice(&values));
+    filler.set_len(0).unwrap();
+    drop(open(&dir));
+    let sums = directory.sum_counts().unwrap();
+    assert_eq!((&sums.running, &sums.ended), (&values, &values));
+    drop(directory);
+    assert_eq!(files(&dir), Vec::<String>::new());
 }
 
 #[tokio::test]

@@ -20,6 +20,8 @@ use crate::agent::delivery::Sent;
 use crate::agent::delivery_report;
 use crate::agent::incoming::Incoming;
 use crate::agent::stated::HeldLetters;
+#[cfg(feature = "opentelemetry")]
+use crate::agent::trace_context;
 use crate::domain::Domain;
 use crate::error::{ReceiveError, SendError};
 
@@ -143,6 +145,8 @@ impl Endpoint {
             }
             Checked::No => None,
         };
+        #[cfg(feature = "opentelemetry")]
+        let letter = trace_context::added_to(letter, self.domain.inner.max_letter);
         let receivers = message.receivers();
         if self.held.must_hold(&self.domain, receivers) {
             let held = (letter, receivers);

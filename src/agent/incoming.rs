@@ -16,6 +16,8 @@ use fipa_mts::stamped_peer;
 use fipa_sds::Entry;
 use fipa_transport::{Incarnation, Kind, PeerId};
 
+#[cfg(feature = "opentelemetry")]
+use crate::agent::trace_context;
 #[cfg(feature = "protocols")]
 use crate::domain::directory_view::DirectoryView;
 
@@ -213,6 +215,28 @@ impl Incoming {
     #[must_use]
     pub fn letter(&self) -> &Letter {
         &self.parts.letter
+    }
+
+    /// Returns an OpenTelemetry context whose span is the remote one in which the message was sent (feature
+    /// `opentelemetry`). Without such a span, the context has none. A span that is started with this context, or whose
+    /// parent it becomes, is a child of the sender's span:
+    ///
+    /// ```no_run
+    /// # async fn example(arm: fipa::Agent) -> Result<(), fipa::error::ReceiveError> {
+    /// use opentelemetry::{global, trace::Tracer};
+    ///
+    /// let incoming = arm.receive().await?;
+    /// let tracer = global::tracer("arm");
+    /// let span = tracer.start_with_context("handle", &incoming.trace_context());
+    /// # Ok(())
+    /// # }
+    /// ```
+    ///
+    /// The sender states the span, and its host is all that keys prove. See [traces](crate#traces).
+    #[cfg(feature = "opentelemetry")]
+    #[must_use]
+    pub fn trace_context(&self) -> opentelemetry::Context {
+        trace_context::of(&self.parts.letter)
     }
 
     /// Returns the violation of the message's protocol, if there is one and `monitor.check` is `warn`

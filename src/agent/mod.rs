@@ -15,6 +15,8 @@ pub(crate) mod sender_tasks;
 pub(crate) mod stated;
 #[cfg(feature = "protocols")]
 pub(crate) mod topics;
+#[cfg(feature = "opentelemetry")]
+pub(crate) mod trace_context;
 #[cfg(not(feature = "protocols"))]
 pub(crate) mod without_protocols;
 
@@ -320,6 +322,8 @@ impl Agent {
         let receivers: Vec<&str> = receivers.map(AgentId::name).collect();
         let name = receivers.iter().map(|name| name.len()).max();
         let head_room = name.unwrap_or(0) + draft.head_len();
+        #[cfg(feature = "opentelemetry")]
+        let head_room = head_room + trace_context::ROOM;
         let incarnation = self.core.endpoint.incarnation;
         let content = self.core.endpoint.mts().loan(
             incarnation,

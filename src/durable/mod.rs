@@ -14,14 +14,14 @@
 pub(crate) mod cuts;
 
 use std::ffi::OsString;
-use std::fs::{self, DirBuilder, File};
+use std::fs::{self, File};
 use std::io::{self, Write as _};
-use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, fchown};
+use std::os::unix::fs::{MetadataExt as _, fchown};
 use std::path::{Path, PathBuf};
 
 #[cfg(test)]
 use cuts::{Step, record};
-use rustix::fs::{Mode, OFlags, RenameFlags, mkdirat, openat, renameat_with};
+use rustix::fs::{Mode, OFlags, openat};
 use rustix::process::geteuid;
 
 /// Replaces a file, or creates it.
@@ -36,7 +36,7 @@ pub(crate) fn replace(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
 ///
 /// # Errors
 /// [`io::ErrorKind::AlreadyExists`] if the file exists.
-#[cfg(feature = "secure")]
+#[cfg(any(feature = "secure", feature = "web"))]
 pub(crate) fn create(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
     let new = write_beside(path, bytes, mode)?;
     or_remove(&new, link(&new, path))?;
@@ -62,7 +62,16 @@ pub(crate) fn remove(path: &Path) -> io::Result<()> {
     sync_parent(path)
 }
 
+/// Returns the user to whom a file belongs that this process creates with this path.
+#[cfg(feature = "web")]
+pub(crate) fn owner_of_new(path: &Path) -> io::Result<u32> {
+    let directory = File::open(parent(path).unwrap_or(Path::new("/")))?;
+    let owner = Owner::of_new_in(&directory)?;
+    Ok(owner.map_or_else(|| geteuid().as_raw(), |owner| owner.user))
+}
+
 /// Creates a directory and those above it, unless they exist.
+#[cfg(any(feature = "protocols", feature = "secure"))]
 pub(crate) fn create_directories(path: &Path, mode: u32) -> io::Result<()> {
     if path.is_dir() {
         return Ok(());
@@ -97,7 +106,13 @@ pub(crate) fn lock_file(path: &Path) -> io::Result<File> {
     }
 }
 
+#[cfg(any(feature = "protocols", feature = "secure"))]
 fn create_directory(path: &Path, mode: u32) -> io::Result<()> {
+    use std::fs::DirBuilder;
+    use std::os::unix::fs::DirBuilderExt as _;
+
+    use rustix::fs::{RenameFlags, mkdirat, renameat_with};
+
     let parent = File::open(parent(path).unwrap_or(Path::new("/")))?;
     let (Some(owner), Some(name)) = (Owner::of_new_in(&parent)?, path.file_name()) else {
         return DirBuilder::new().mode(mode).create(path);
@@ -185,6 +200,7 @@ fn or_remove<T>(new: &Path, result: io::Result<T>) -> io::Result<T> {
     result
 }
 
+#[cfg(any(feature = "protocols", feature = "secure"))]
 fn rename_only(from: &Path, to: &Path) -> io::Result<()> {
     fs::rename(from, to)?;
     #[cfg(test)]
@@ -192,7 +208,7 @@ fn rename_only(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-#[cfg(feature = "secure")]
+#[cfg(any(feature = "secure", feature = "web"))]
 fn link(from: &Path, to: &Path) -> io::Result<()> {
     fs::hard_link(from, to)?;
     #[cfg(test)]
@@ -200,7 +216,7 @@ fn link(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-#[cfg(feature = "secure")]
+#[cfg(any(feature = "secure", feature = "web"))]
 fn remove_only(path: &Path) -> io::Result<()> {
     fs::remove_file(path)?;
     #[cfg(test)]

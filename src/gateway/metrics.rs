@@ -245,8 +245,9 @@ fn letters(families: &mut Families, all: &Totals) {
 fn waiting(families: &mut Families, running: &Totals) {
     let outcomes = |direction| {
         let all = LetterOutcome::ALL.into_iter();
+        // The numbers of another process may be any.
         all.map(|outcome| running.all_letters(direction, outcome))
-            .sum::<u64>()
+            .fold(0, u64::wrapping_add)
     };
     let under_way = running
         .events(Event::Submitted)

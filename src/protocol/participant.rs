@@ -13,6 +13,8 @@ use super::dialogue::{
 use super::receivers::expand;
 use crate::agent::delivery::deliveries;
 use crate::agent::incoming::Incoming;
+#[cfg(feature = "opentelemetry")]
+use crate::agent::trace_context;
 use crate::agent::{Agent, AgentCore};
 
 /// The last message of a participant.
@@ -73,6 +75,9 @@ impl Agent {
 pub struct Task {
     dialogue: Dialogue,
     first: Message,
+    /// The letter of the first message.
+    #[cfg(feature = "opentelemetry")]
+    first_letter: fipa_acl::Letter,
     /// The last message of the initiator, which the next message answers.
     last: Message,
     /// A message that arrived instead of a decision.
@@ -174,6 +179,8 @@ impl Task {
         Ok(Self {
             dialogue: Dialogue::join(core, first)?,
             first: first.message().clone(),
+            #[cfg(feature = "opentelemetry")]
+            first_letter: first.letter().clone(),
             last: first.message().clone(),
             early: None,
             asked: Vec::new(),
@@ -186,6 +193,14 @@ impl Task {
     #[must_use]
     pub fn message(&self) -> &Message {
         &self.last
+    }
+
+    /// Returns an OpenTelemetry context whose span is the remote one in which the first message of the conversation was
+    /// sent (feature `opentelemetry`); see [`Incoming::trace_context`].
+    #[cfg(feature = "opentelemetry")]
+    #[must_use]
+    pub fn trace_context(&self) -> opentelemetry::Context {
+        trace_context::of(&self.first_letter)
     }
 
     /// Returns the state of the conversation: the name of the state in the file of the protocol

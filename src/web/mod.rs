@@ -110,13 +110,13 @@ impl Listener {
     pub(crate) async fn serve(self, source: Arc<dyn Source>, pages: Pages) {
         let routes = requests::routes(source, self.token, self.names, pages);
         let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
-        // They end with this task.
+        // Dropped with this future: the connections end with the gateway.
         let mut connections = JoinSet::new();
         loop {
+            while connections.try_join_next().is_some() {}
             let Ok(place) = Arc::clone(&places).acquire_owned().await else {
                 return;
             };
-            while connections.try_join_next().is_some() {}
             let stream = match self.socket.accept().await {
                 Ok((stream, _)) => stream,
                 Err(error) => {
@@ -154,11 +154,72 @@ async fn answer(stream: TcpStream, routes: axum::Router) -> Option<Result<(), hy
             .header_read_timeout(HEAD_TIMEOUT)
             .max_buf_size(MAX_HEAD)
             .keep_alive(false)
+            // A client may close its side after the request, as `nc -N` does.
+            .half_close(true)
             .serve_connection(TokioIo::new(stream), TowerToHyperService::new(routes))
     );
     match tokio::time::timeout(CONNECTION_TIMEOUT, &mut connection).await {
         Ok(answered) => Some(answered),
         Err(_) if keep_open.is_kept() => Some(connection.await),
         Err(_) => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use tokio::io::AsyncWriteExt as _;
+
+    use super::*;
+
+    /// A source that is never ready, and counts the questions that wait.
+    #[derive(Default)]
+    struct Stuck(AtomicUsize);
+
+    struct Waiting<'a>(&'a AtomicUsize);
+
+    impl Drop for Waiting<'_> {
+        fn drop(&mut self) {
+            self.0.fetch_sub(1, Ordering::Relaxed);
+        }
+    }
+
+    impl Source for Stuck {
+        fn metrics(&self) -> Result<Families, String> {
+            Ok(Families::default())
+        }
+
+        fn readiness(&self) -> Pin<Box<dyn Future<Output = Result<(), String>> + Send + '_>> {
+            self.0.fetch_add(1, Ordering::Relaxed);
+            let waiting = Waiting(&self.0);
+            Box::pin(async move {
+                let _waiting = waiting;
+                std::future::pending().await
+            })
+        }
+    }
+
+    #[tokio::test]
+    async fn connections_end_with_the_listener() {
+        let listener = Listener::open("127.0.0.1:0", &[], Token::for_tests()).unwrap();
+        let address = listener.address();
+        let source = Arc::new(Stuck::default());
+        let serving = tokio::spawn(listener.serve(Arc::clone(&source) as Arc<dyn Source>, Pages::default()));
+        let mut client = TcpStream::connect(address).await.unwrap();
+        let request = "GET /readyz HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer 0123456789abcdef\r\n\r\n";
+        client.write_all(request.as_bytes()).await.unwrap();
+        while source.0.load(Ordering::Relaxed) == 0 {
+            tokio::task::yield_now().await;
+        }
+        serving.abort();
+        assert!(serving.await.unwrap_err().is_cancelled());
+        // The runtime has one thread, which drops the task of the connection as soon as this one yields.
+        for _ in 0..10 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(source.0.load(Ordering::Relaxed), 0);
     }
 }

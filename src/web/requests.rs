@@ -177,7 +177,11 @@ impl Admission {
     /// Returns the answer to a request that is not admitted.
     fn check(&self, request: &Request) -> Option<Response> {
         let headers = request.headers();
-        let Some(host) = only(headers, HOST).filter(|host| self.is_own(host)) else {
+        // A request line with a whole URI names the host, too.
+        let target = request.uri().authority().map(Authority::as_str);
+        let is_own_target = target.is_none_or(|target| self.is_own(target));
+        let host = only(headers, HOST).filter(|host| is_own_target && self.is_own(host));
+        let Some(host) = host else {
             let why = "this name is not in http.names of the gateway's configuration\n";
             return Some((StatusCode::MISDIRECTED_REQUEST, why).into_response());
         };

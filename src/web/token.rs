@@ -1,14 +1,17 @@
 //! The token that clients of the listener send.
 
 use std::fmt::{self, Write as _};
-use std::fs::{self, File};
-use std::io::{self, Read as _, Write as _};
+use std::fs::File;
+use std::io::{self, Read as _};
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
+use rustix::io::Errno;
 use rustix::process::geteuid;
 use subtle::ConstantTimeEq as _;
+
+use crate::durable;
 
 /// Number of random bytes of a new token.
 const RANDOM: usize = 16;
@@ -39,6 +42,12 @@ pub enum TokenError {
         path: PathBuf,
         /// The error of the operating system.
         source: io::Error,
+    },
+    /// The path is a link, a directory or a device.
+    #[error("{} must be a regular file, and no link", path.display())]
+    NotAFile {
+        /// The path.
+        path: PathBuf,
     },
     /// Other users can read or change the file.
     #[error(
@@ -83,15 +92,27 @@ impl Token {
             }
         };
         match Self::create(path) {
-            Ok(token) => return Ok(token),
+            Ok(()) => {}
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
             Err(error) => return Err(io("create")(error)),
         }
         let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
         let opened = File::options().read(true).custom_flags(flags).open(path);
-        let file = opened.map_err(io("open"))?;
+        let not_a_file = || TokenError::NotAFile {
+            path: path.to_owned(),
+        };
+        let file = match opened {
+            Err(error) if error.raw_os_error() == Some(Errno::LOOP.raw_os_error()) => {
+                return Err(not_a_file());
+            }
+            opened => opened.map_err(io("open"))?,
+        };
         let found = file.metadata().map_err(io("examine"))?;
-        let is_own = found.is_file() && found.uid() == geteuid().as_raw();
+        if !found.is_file() {
+            return Err(not_a_file());
+        }
+        let owner = durable::owner_of_new(path).map_err(io("examine"))?;
+        let is_own = [owner, geteuid().as_raw()].contains(&found.uid());
         if !is_own || found.mode() & 0o077 != 0 {
             let path = path.to_owned();
             return Err(TokenError::Open { path });
@@ -112,20 +133,15 @@ impl Token {
         }
     }
 
-    fn create(path: &Path) -> io::Result<Self> {
-        let token = random_text()?;
-        let new = File::options()
-            .write(true)
-            .create_new(true)
-            .mode(0o600)
-            .open(path);
-        let written = new?.write_all(format!("{token}\n").as_bytes());
-        if let Err(error) = written {
-            // The first error is the one to return.
-            let _ = fs::remove_file(path);
-            return Err(error);
+    /// Creates the file with all of its content at once. An empty file would keep the gateway from starting.
+    fn create(path: &Path) -> io::Result<()> {
+        match path.symlink_metadata() {
+            Ok(_) => return Err(io::ErrorKind::AlreadyExists.into()),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => return Err(error),
         }
-        Ok(Self(token))
+        let token = random_text()? + "\n";
+        durable::create(path, token.as_bytes(), 0o600)
     }
 
     /// Whether a client has sent this token. The time does not depend on the position of a wrong byte.
@@ -143,8 +159,8 @@ impl Token {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 
-    use std::fs::Permissions;
-    use std::os::unix::fs::PermissionsExt as _;
+    use std::fs::{self, Permissions};
+    use std::os::unix::fs::{PermissionsExt as _, symlink};
 
     use super::*;
 
@@ -189,5 +205,57 @@ mod tests {
         }
         write(b"0123456789abcdef\r\n", 0o600);
         assert!(Token::load(&path).is_ok());
+    }
+
+    #[test]
+    fn a_token_survives_a_loss_of_power_as_it_is_created() {
+        let load = |root: &Path| Token::load(&root.join("http.token")).map(|token| token.0);
+        let cuts = durable::cuts::of(
+            |_| {},
+            |root| load(root).unwrap(),
+            |root, created| {
+                let found = load(root).unwrap();
+                assert!(created.is_none_or(|created| *created == found));
+            },
+        );
+        assert!(cuts > 0);
+    }
+
+    #[test]
+    fn processes_that_start_at_the_same_time_have_one_token() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("http.token");
+        let tokens: Vec<String> = std::thread::scope(|scope| {
+            let threads: Vec<_> = (0..8)
+                .map(|_| scope.spawn(|| Token::load(&path).unwrap().0))
+                .collect();
+            threads.into_iter().map(|it| it.join().unwrap()).collect()
+        });
+        assert!(tokens.iter().all(|token| *token == tokens[0]), "{tokens:?}");
+        assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_link_or_a_directory_is_no_token() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("http.token");
+        let other = directory.path().join("other");
+        symlink(&other, &path).unwrap();
+        assert!(matches!(
+            Token::load(&path),
+            Err(TokenError::NotAFile { .. })
+        ));
+        assert!(!other.exists(), "a link was followed");
+        Token::load(&other).unwrap();
+        assert!(matches!(
+            Token::load(&path),
+            Err(TokenError::NotAFile { .. })
+        ));
+        fs::remove_file(&path).unwrap();
+        fs::create_dir(&path).unwrap();
+        assert!(matches!(
+            Token::load(&path),
+            Err(TokenError::NotAFile { .. })
+        ));
     }
 }

@@ -15,6 +15,9 @@ const OWN_FILE: Mode = Mode::RUSR.union(Mode::WUSR);
 /// Mode of a file of a group.
 const SHARED_FILE: Mode = OWN_FILE.union(Mode::RGRP).union(Mode::WGRP);
 
+/// Mode of a file of this user that a group can read.
+const READABLE_FILE: Mode = OWN_FILE.union(Mode::RGRP);
+
 /// Mode of a directory of a group. No sticky bit, because the processes that run remove the files of those that
 /// were killed.
 const SHARED_DIRECTORY: Mode = Mode::RWXU.union(Mode::RWXG);
@@ -169,9 +172,22 @@ impl DomainUsers {
     /// # Errors
     /// The error of the operating system.
     pub fn create_file(self, directory: impl AsFd, name: &str) -> io::Result<OwnedFd> {
+        self.create(directory, name, SHARED_FILE)
+    }
+
+    /// Creates a file that only this user may write to, at any time. The other members of a group can read it.
+    ///
+    /// # Errors
+    /// As for [`create_file`](Self::create_file).
+    pub fn create_readable_file(self, directory: impl AsFd, name: &str) -> io::Result<OwnedFd> {
+        self.create(directory, name, READABLE_FILE)
+    }
+
+    /// Creates a file, which has this mode if a group shares it.
+    fn create(self, directory: impl AsFd, name: &str, shared: Mode) -> io::Result<OwnedFd> {
         let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::CLOEXEC;
         let file = rustix::fs::openat(&directory, name, flags, OWN_FILE)?;
-        if let Err(error) = self.share(&file, SHARED_FILE) {
+        if let Err(error) = self.share(&file, shared) {
             // The first error is the one to return.
             let _ = rustix::fs::unlinkat(&directory, name, AtFlags::empty());
             return Err(error.into());
@@ -297,9 +313,14 @@ mod tests {
     #[test]
     fn directories_and_files_are_open_to_their_users_only() {
         let home = tempfile::tempdir().unwrap();
-        for (users, name, modes) in [
-            (DomainUsers::This, "own", (0o700, 0o600)),
-            (DomainUsers::Group(this_group()), "shared", (0o770, 0o660)),
+        for (users, name, modes, readable) in [
+            (DomainUsers::This, "own", (0o700, 0o600), 0o600),
+            (
+                DomainUsers::Group(this_group()),
+                "shared",
+                (0o770, 0o660),
+                0o640,
+            ),
         ] {
             let path = home.path().join(name);
             let directory = users.create_directory(&path).unwrap();
@@ -311,6 +332,8 @@ mod tests {
             users.share_socket(&directory, "socket").unwrap();
             assert_eq!((mode(&path), mode(&path.join("file"))), modes);
             assert_eq!(mode(&path.join("socket")), modes.1);
+            users.create_readable_file(&directory, "readable").unwrap();
+            assert_eq!(mode(&path.join("readable")), readable);
             let found = rustix::fs::statat(&directory, "file", AtFlags::empty()).unwrap();
             assert!(users.own(&found));
         }

@@ -77,6 +77,13 @@ pub struct Received {
     pub user_defined: Vec<(String, String)>,
 }
 
+impl EnvelopeParams {
+    /// Name of the user-defined parameter with the span in which the letter was sent (W3C Trace Context).
+    pub const TRACEPARENT: &str = "traceparent";
+    /// Name of the user-defined parameter with the values of tracing systems for that span (W3C Trace Context).
+    pub const TRACESTATE: &str = "tracestate";
+}
+
 impl Received {
     /// Creates a stamp with the mandatory parameters only.
     #[must_use]

@@ -205,7 +205,7 @@ impl HostDir {
         }
         guard.sweep()?;
         let temporary = Name::Temporary(self.id);
-        let file = self.create(temporary)?;
+        let file = self.create(temporary, Writers::All)?;
         // Locked before it appears under its name, because an unlocked lock file indicates a dead
         // process.
         file.try_lock().map_err(|error| match error {
@@ -513,12 +513,18 @@ impl HostDir {
         match rustix::fs::openat(&self.dir, name.to_string(), flags, Mode::empty()) {
             Ok(file) => check_file(file, &self.path, name, self.users).map(Some),
             Err(Errno::NOENT) => Ok(None),
+            // A symbolic link.
+            Err(Errno::LOOP) => Err(not_private(&self.path, name)),
             Err(error) => Err(self.io("open", name)(error.into())),
         }
     }
 
-    fn create(&self, name: Name) -> Result<File, HostError> {
-        let file = self.users.create_file(&self.dir, &name.to_string());
+    fn create(&self, name: Name, writers: Writers) -> Result<File, HostError> {
+        let (dir, path) = (&self.dir, name.to_string());
+        let file = match writers {
+            Writers::All => self.users.create_file(dir, &path),
+            Writers::This => self.users.create_readable_file(dir, &path),
+        };
         file.map(File::from).map_err(self.io("create", name))
     }
 
@@ -538,6 +544,15 @@ impl HostDir {
         let path = self.path.join(name.to_string());
         move |source| HostError::Io { what, path, source }
     }
+}
+
+/// The users of the domain who may write to a file.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Writers {
+    /// All users of the domain.
+    All,
+    /// The user of this process.
+    This,
 }
 
 /// The content of a file.
@@ -648,7 +663,7 @@ impl Guard<'_> {
     pub(super) fn write(&self, name: Name, bytes: &[u8]) -> Result<(), HostError> {
         let host_dir = self.host_dir;
         let generation = host_dir.generation()?.wrapping_add(1);
-        self.replace(name, bytes, |file| {
+        self.replace(name, bytes, Writers::All, |file| {
             // The modification time is the version: clocks are too coarse and inodes are reused, so
             // neither distinguishes two files of one process.
             let version = Timespec {
@@ -663,7 +678,8 @@ impl Guard<'_> {
                 },
                 last_modification: version,
             };
-            Ok(rustix::fs::futimens(file, &times)?)
+            let set = rustix::fs::futimens(file, &times);
+            set.map_err(|error| host_dir.io("write", name)(error.into()))
         })?;
         let at = RING_START + (SLOT * index_of(generation)) as u64;
         host_dir
@@ -678,15 +694,17 @@ impl Guard<'_> {
         &self,
         name: Name,
         bytes: &[u8],
-        finish: impl FnOnce(&File) -> io::Result<()>,
+        writers: Writers,
+        finish: impl FnOnce(&File) -> Result<(), HostError>,
     ) -> Result<File, HostError> {
         let host_dir = self.host_dir;
         let temporary = Name::Temporary(host_dir.id);
         host_dir.remove(temporary)?;
-        let mut file = host_dir.create(temporary)?;
-        let written = file.write_all(bytes).and_then(|()| finish(&file));
+        let mut file = host_dir.create(temporary, writers)?;
+        let written = file.write_all(bytes);
         let renamed = written
             .map_err(host_dir.io("write", temporary))
+            .and_then(|()| finish(&file))
             .and_then(|()| host_dir.rename(temporary, name));
         if let Err(error) = renamed {
             // The first error is returned; the next sweep removes the temporary file.
@@ -722,7 +740,7 @@ impl Guard<'_> {
             living.insert(id, lives);
             match name {
                 _ if lives => {}
-                Name::Counts(id) => self.keep_counts(id)?,
+                Name::Counts(id) => self.keep_counts(id),
                 name => self.host_dir.remove(name)?,
             }
         }
@@ -734,7 +752,7 @@ impl Guard<'_> {
         self.host_dir.remove(Name::Entries(id))?;
         self.host_dir.remove(Name::Remote(id))?;
         self.host_dir.remove(Name::Socket(id))?;
-        self.keep_counts(id)?;
+        self.keep_counts(id);
         self.host_dir.remove(Name::Temporary(id))?;
         self.host_dir.remove(Name::Process(id))
     }
@@ -745,6 +763,12 @@ impl Guard<'_> {
         // Last, because the lock shows that this process is running.
         drop(self.host_dir.process.lock().take());
         if self.sweep()? == 0 && self.is_current()? {
+            // Those of which the values were not kept.
+            for name in self.host_dir.names()? {
+                if matches!(name, Name::Counts(_)) {
+                    self.host_dir.remove(name)?;
+                }
+            }
             self.host_dir.remove(Name::Ended)?;
             self.host_dir.remove(Name::Domain)?;
         }
@@ -801,8 +825,14 @@ fn check_file(
     if is_file && users.own(&stat) {
         return Ok(File::from(file));
     }
-    let why = "it is not a regular file of the users of this domain".to_owned();
-    Err(HostError::NotPrivate { path, why })
+    Err(not_private(dir, name))
+}
+
+fn not_private(dir: &Path, name: Name) -> HostError {
+    HostError::NotPrivate {
+        path: dir.join(name.to_string()),
+        why: "it is not a regular file of the users of this domain".to_owned(),
+    }
 }
 
 #[cfg(test)]

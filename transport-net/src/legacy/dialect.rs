@@ -58,7 +58,7 @@ pub(crate) fn translate(
     reply_address: Option<ReplyAddress<'_>>,
 ) -> Result<[Bytes; 2], TranslateError> {
     let signature = at.signature();
-    let envelope = letter.parse_envelope()?;
+    let mut envelope = letter.parse_envelope()?;
     let message = Message::decode(letter.payload())?;
     let to = receiver_of(&envelope, receiver)?;
     match signature {
@@ -66,6 +66,7 @@ pub(crate) fn translate(
             let (representation, dialect) = (Representation::BitEfficient, Dialect::FipaServices);
             let message = message.encode(representation, dialect)?;
             let length = message.len() as u64;
+            remove_trace_context(&mut envelope);
             let envelope = addressed(envelope, to, AclRepresentation::BitEfficient, length);
             Ok([envelope.encode(representation, dialect)?, message])
         }
@@ -144,6 +145,22 @@ fn addressed(
     envelope.base.acl_representation = Some(representation);
     envelope.base.payload_length = Some(length);
     envelope
+}
+
+/// Removes the parameters for which fipa_services has no place, and without which the letter means the same.
+fn remove_trace_context(envelope: &mut Envelope) {
+    let is_trace = |name: &str| {
+        matches!(
+            name,
+            EnvelopeParams::TRACEPARENT | EnvelopeParams::TRACESTATE
+        )
+    };
+    for part in [&mut envelope.base]
+        .into_iter()
+        .chain(&mut envelope.extensions)
+    {
+        part.user_defined.retain(|(name, _)| !is_trace(name));
+    }
 }
 
 fn add_address(agent: &mut AgentId, url: &str) {
@@ -338,6 +355,43 @@ mod tests {
             assert_eq!(said.content().unwrap(), content);
             assert_eq!(said.conversation_id(), Some("c-1"));
         }
+    }
+
+    #[test]
+    fn jade_gets_the_trace_context_of_a_letter_and_fipa_services_does_not() {
+        let pair = |name: &str, value: &str| (name.to_owned(), value.to_owned());
+        let trace = [
+            pair(
+                EnvelopeParams::TRACEPARENT,
+                "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01",
+            ),
+            pair(EnvelopeParams::TRACESTATE, "vendor=a b\"c<d"),
+        ];
+        let with = |pairs: &[(String, String)]| {
+            let mut envelope = letter("hello").parse_envelope().unwrap();
+            envelope.base.user_defined = pairs.to_vec();
+            envelope.extensions[0].user_defined = pairs.to_vec();
+            let envelope = envelope.encode_standard().unwrap();
+            Letter::new(envelope, letter("hello").into_payload())
+        };
+        let received = |letter: &Letter, signature| {
+            let at = at(Kind::Tcp, signature);
+            let [envelope, _] = translate(letter, "arm", &at, None)?;
+            Ok::<_, TranslateError>(
+                Envelope::decode(&envelope)
+                    .unwrap()
+                    .0
+                    .effective()
+                    .user_defined,
+            )
+        };
+        let letter = with(&trace);
+        assert_eq!(received(&letter, Signature::JadeProxy).unwrap(), trace);
+        assert_eq!(received(&letter, Signature::FipaServices).unwrap(), []);
+        // Other parameters may change the meaning of the letter.
+        let letter = with(&[pair("other", "value")]);
+        let refused = received(&letter, Signature::FipaServices).unwrap_err();
+        assert_eq!(refused.fault(), TransportErrorKind::Inexpressible);
     }
 
     #[test]

@@ -7,9 +7,10 @@ mod recorder;
 pub(super) mod tools;
 mod topics;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use clap::builder::{PathBufValueParser, TypedValueParser};
 use clap::{Args, Subcommand};
 
 use super::watch::filter::Filter;
@@ -59,7 +60,7 @@ pub(crate) struct Arguments {
     tool: Option<Tool>,
 
     /// File to write
-    #[arg(short, long, value_name = "FILE", required = true)]
+    #[arg(short, long, value_name = "FILE", required = true, value_parser = file_name())]
     output: Option<PathBuf>,
 
     #[command(flatten)]
@@ -114,6 +115,14 @@ enum Tool {
     Repair(tools::copy::Repair),
     Filter(Box<tools::copy::Filtered>),
     ToJson(Box<tools::to_json::Arguments>),
+}
+
+/// Parses the name of a file to write.
+fn file_name() -> impl TypedValueParser<Value = PathBuf> {
+    PathBufValueParser::new().try_map(|path| match path == Path::new("-") {
+        true => Err("a recording is written to a file, not to standard output"),
+        false => Ok(path),
+    })
 }
 
 /// Parses an amount of content.

@@ -1,6 +1,7 @@
 //! Writes the observed events to the files of a recording, in a thread of its own.
 
 use std::collections::{BTreeMap, HashMap};
+use std::io::ErrorKind;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -9,6 +10,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use fipa::Entry;
 use fipa::admin::watch::{Event, Passage};
 use fipa_acl::escape;
+use mcap::McapError;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
@@ -18,7 +20,7 @@ use super::locks::Grants;
 use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
 use crate::command::watch::filter::Filter;
 use crate::command::watch::{OBSERVATION_DELAY, json};
-use crate::report::Failure;
+use crate::report::{self, Failure};
 use crate::{input, output};
 
 /// An observation for the thread that writes.
@@ -380,17 +382,26 @@ impl Recorder {
     }
 
     fn value(&mut self, value: &TopicValue) -> Result<(), Failure> {
+        let topic = format!("/topics/{}/{}", escape(&value.agent), escape(&value.topic));
+        let encoding = match &*value.media_type {
+            "application/json" => file::JSON,
+            // Messages with this encoding are the bytes of letters.
+            file::LETTER => "",
+            other => other,
+        };
         let open = self.open()?;
+        if !open.file.has_room(&topic, encoding) {
+            // Topics that come and go may have any number of names.
+            let missed = value.missed.saturating_add(1);
+            open.totals.missed += missed;
+            add(&self.counts.missed, missed);
+            return Ok(());
+        }
         open.totals.values += 1;
         open.totals.missed += value.missed;
         let sequence = (open.totals.values & u64::from(u32::MAX)) as u32;
         add(&self.counts.values, 1);
         add(&self.counts.missed, value.missed);
-        let topic = format!("/topics/{}/{}", escape(&value.agent), escape(&value.topic));
-        let encoding = match &*value.media_type {
-            "application/json" => file::JSON,
-            other => other,
-        };
         let target = Target {
             topic: &topic,
             encoding,
@@ -458,13 +469,23 @@ impl Recorder {
 
     /// Ends chunks and files at their times.
     fn handle_time(&mut self) -> Result<(), Failure> {
+        let sync = self.sync;
         let open = self.open()?;
-        if open.flushed.elapsed() >= self.sync {
+        let mut is_removed = false;
+        if open.flushed.elapsed() >= sync {
+            let removed = open.file.is_removed();
+            is_removed = removed.map_err(|error| failed(&error, input::name(&open.path)))?;
+            if is_removed {
+                let path = input::name(&open.path);
+                report::warn(&format!(
+                    "{path} was removed; the recording goes on in a new file"
+                ));
+            }
             self.flush()?;
         }
         let open = self.open()?;
         let (written, since) = (open.file.written(), open.since);
-        if !self.split.is_full(written, since) {
+        if !is_removed && !self.split.is_full(written, since) {
             return Ok(());
         }
         self.close()?;
@@ -563,11 +584,15 @@ fn nanos(time: SystemTime) -> u64 {
 
 /// The error report of a file that cannot be written.
 pub(super) fn failed(error: &RecordingError, path: String) -> Failure {
-    let help = match error {
-        RecordingError::Io(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {
-            "give another name, or remove the file"
+    let cause = match error {
+        RecordingError::Io(error) | RecordingError::Mcap(McapError::Io(error)) => {
+            Some(error.kind())
         }
-        RecordingError::Io(error) if error.kind() == std::io::ErrorKind::StorageFull => {
+        _ => None,
+    };
+    let help = match cause {
+        Some(ErrorKind::AlreadyExists) => "give another name; an existing file is not overwritten",
+        Some(ErrorKind::StorageFull | ErrorKind::QuotaExceeded) => {
             "free space on the disk, or limit the recording with --split-size and --keep"
         }
         _ => "give a file that this user can write, on a disk with free space",
@@ -577,4 +602,21 @@ pub(super) fn failed(error: &RecordingError, path: String) -> Failure {
         fipa::error::ErrorChain(error)
     );
     Failure::failed(problem, path, help)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_disk_is_explained_also_by_the_format() {
+        let full = || std::io::Error::from(ErrorKind::StorageFull);
+        for error in [
+            RecordingError::Io(full()),
+            RecordingError::Mcap(McapError::Io(full())),
+        ] {
+            let failure = failed(&error, "run.mcap".to_owned());
+            assert!(format!("{failure:?}").contains("--keep"), "{failure:?}");
+        }
+    }
 }

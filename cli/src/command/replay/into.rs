@@ -170,7 +170,7 @@ async fn send_all(
     });
     let run = format!("replay-{}", Incarnation::random());
     let began = Instant::now();
-    let mut first = None;
+    let mut course = prepare::Course::new(arguments.speed);
     let mut under_way = JoinSet::new();
     while let Some(letter) = letters.recv().await {
         if !is_of(&letter, &arguments.only) {
@@ -181,8 +181,7 @@ async fn send_all(
             *tally.left_out.entry(reason).or_default() += 1;
             continue;
         }
-        let first = *first.get_or_insert(letter.at);
-        let delay = prepare::delay(letter.at, first, arguments.speed);
+        let delay = course.delay(letter.at);
         tokio::time::sleep(delay.saturating_sub(began.elapsed())).await;
         let sender = letter.message.as_ref().and_then(|message| message.sender());
         let agent = sender.and_then(|sender| agents.get(sender.name()));

@@ -21,7 +21,7 @@ use crate::report::Failure;
 /// With --into, the command joins a domain and sends the letters to the agents of the same names there. Sent letters
 /// can move robots. Therefore the command refuses the domain of the recording without --live. Without --all it leaves
 /// out requests (request, request-when, request-whenever, propagate, proxy), calls (cfp), awards (accept-proposal),
-/// messages with a fence, and the messages of locks. It always leaves out letters of message transport services, and
+/// performatives of your own, messages with a fence, and the messages of locks. It always leaves out letters of message transport services, and
 /// letters whose content is not whole in the recording.
 ///
 /// The senders are `replay/NAME`. Each conversation has a new identifier, and `reply-by` moves by the time since the
@@ -58,7 +58,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FACTOR", default_value = "1", value_parser = speed, conflicts_with = "check")]
     speed: f64,
 
-    /// With --into: send also requests, calls, awards, and messages with a fence
+    /// With --into: send also requests, calls, awards, performatives of your own, and messages with a fence
     #[arg(long, conflicts_with = "check")]
     all: bool,
 

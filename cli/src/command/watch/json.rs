@@ -158,7 +158,9 @@ fn verdict(checked: &CheckResult) -> Value {
 /// The message with the observed part of its content.
 pub(in crate::command) fn message(passage: &Passage) -> Option<Message> {
     let message = passage.message.clone()?;
-    if passage.content.is_empty() {
+    // Empty content differs from none.
+    let has_empty = passage.content_len == Some(0);
+    if passage.content.is_empty() && !has_empty {
         return Some(message);
     }
     let bare = message.clone();

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use mcap::records::{Channel, MessageHeader, Metadata, SchemaHeader};
+use mcap::records::{Channel, ChunkHeader, MessageHeader, Metadata, SchemaHeader};
 
 /// The rest of a record.
 struct Fields<'a>(&'a [u8]);
@@ -56,6 +56,31 @@ impl<'a> Fields<'a> {
         }
         Some(map)
     }
+}
+
+/// Returns a chunk and its records as they are stored; `None` if the record is malformed.
+pub(super) fn chunk(record: &[u8]) -> Option<(ChunkHeader, &[u8])> {
+    let mut fields = Fields(record);
+    let header = ChunkHeader {
+        message_start_time: fields.u64()?,
+        message_end_time: fields.u64()?,
+        uncompressed_size: fields.u64()?,
+        uncompressed_crc: fields.u32()?,
+        compression: fields.text()?,
+        compressed_size: fields.u64()?,
+    };
+    let len = usize::try_from(header.compressed_size).ok()?;
+    Some((header, fields.bytes(len)?))
+}
+
+/// Splits the first record off the records of a chunk; `None` if it is not whole.
+pub(super) fn next_record<'a>(records: &mut &'a [u8]) -> Option<(u8, &'a [u8])> {
+    let mut fields = Fields(records);
+    let [opcode] = fields.array()?;
+    let len = usize::try_from(fields.u64()?).ok()?;
+    let data = fields.bytes(len)?;
+    *records = fields.0;
+    Some((opcode, data))
 }
 
 /// Returns a schema and its data; `None` if the record is malformed.

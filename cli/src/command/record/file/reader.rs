@@ -3,6 +3,7 @@
 //! A file comes from outside. The records and the chunks of a file, before and after decompression, have a maximum
 //! length, which is checked before memory is taken. The messages of a chunk are read after its checksum is verified.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::io::{self, ErrorKind, Read};
 
@@ -17,6 +18,10 @@ use crate::report::Failure;
 pub(in crate::command) const MAX_RECORD: usize = 64 << 20;
 /// Maximum length of all channels and schemas of a file, in bytes.
 const MAX_CHANNELS: usize = 16 << 20;
+/// Maximum length of a channel or a metadata record, whose pairs of texts take more memory than bytes of the file.
+const MAX_PAIRS: usize = 4 << 20;
+/// Bytes that a pair of texts counts in addition to its texts.
+const PAIR: usize = 128;
 /// Bytes that are read at once.
 const PIECE: usize = 256 << 10;
 
@@ -62,7 +67,7 @@ pub(in crate::command) fn read(
     let mut records = LinearReader::new_with_options(
         LinearReaderOptions::default()
             .with_skip_end_magic(true)
-            .with_prevalidate_chunk_crcs(true)
+            .with_emit_chunks(true)
             .with_record_length_limit(MAX_RECORD),
     );
     let mut known = Known::default();
@@ -84,15 +89,54 @@ pub(in crate::command) fn read(
             Some(Err(error)) => return Err(failed(&at_beginning(error, is_empty))),
         };
         has_begun = true;
-        if opcode == op::FOOTER {
-            return Ok(end(true, None));
-        }
-        match known.item(opcode, data) {
-            Ok(Some(item)) => visit(item)?,
-            Ok(None) => {}
-            Err(error) => return Ok(end(false, Some(error))),
+        let damage = match opcode {
+            op::FOOTER => return Ok(end(true, None)),
+            op::CHUNK => match unpacked(data) {
+                Ok(chunk) => known.visit_chunk(&chunk, &mut visit)?,
+                Err(error) => Some(error),
+            },
+            _ => known.visit(opcode, data, &mut visit)?,
+        };
+        if damage.is_some() {
+            return Ok(end(false, damage));
         }
     }
+}
+
+/// Returns the records of a chunk. The reader of the crate `mcap` does not check that the records of a chunk end with
+/// it.
+fn unpacked(chunk: &[u8]) -> Result<Cow<'_, [u8]>, RecordingError> {
+    let (header, stored) = fields::chunk(chunk).ok_or(RecordingError::Malformed(op::CHUNK))?;
+    let records = match header.compression.as_str() {
+        "" => Cow::Borrowed(stored),
+        "zstd" if header.uncompressed_size > MAX_RECORD as u64 => {
+            return Err(McapError::ChunkTooLarge(header.uncompressed_size).into());
+        }
+        "zstd" => {
+            let unpacked = unpacked_zstd(stored, header.uncompressed_size);
+            let unpacked = unpacked.map_err(|it| McapError::DecompressionError(it.to_string()))?;
+            Cow::Owned(unpacked)
+        }
+        _ => return Err(McapError::UnsupportedCompression(header.compression).into()),
+    };
+    if records.len() as u64 != header.uncompressed_size {
+        return Err(RecordingError::Malformed(op::CHUNK));
+    }
+    // The format allows chunks without a checksum.
+    let (saved, calculated) = (header.uncompressed_crc, crc32fast::hash(&records));
+    if saved != 0 && saved != calculated {
+        return Err(McapError::BadChunkCrc { saved, calculated }.into());
+    }
+    Ok(records)
+}
+
+/// Decompresses at most `len` bytes. Takes memory for the bytes that there are.
+fn unpacked_zstd(stored: &[u8], len: u64) -> io::Result<Vec<u8>> {
+    let mut decoder = zstd::Decoder::with_buffer(stored)?;
+    decoder.window_log_max(MAX_RECORD.ilog2())?;
+    let mut unpacked = Vec::new();
+    decoder.take(len).read_to_end(&mut unpacked)?;
+    Ok(unpacked)
 }
 
 /// The error of a file in which no record was found.
@@ -122,6 +166,39 @@ struct Known {
 }
 
 impl Known {
+    /// Visits the item of a record, if it has one. Returns its damage.
+    fn visit(
+        &mut self,
+        opcode: u8,
+        data: &[u8],
+        visit: &mut impl FnMut(Item<'_>) -> Result<(), Failure>,
+    ) -> Result<Option<RecordingError>, Failure> {
+        match self.item(opcode, data) {
+            Ok(Some(item)) => visit(item)?,
+            Ok(None) => {}
+            Err(error) => return Ok(Some(error)),
+        }
+        Ok(None)
+    }
+
+    /// Visits the items of the records of a chunk up to the first damage, and returns it.
+    fn visit_chunk(
+        &mut self,
+        mut records: &[u8],
+        visit: &mut impl FnMut(Item<'_>) -> Result<(), Failure>,
+    ) -> Result<Option<RecordingError>, Failure> {
+        while !records.is_empty() {
+            let Some((opcode, data)) = fields::next_record(&mut records) else {
+                return Ok(Some(RecordingError::Malformed(op::CHUNK)));
+            };
+            let damage = self.visit(opcode, data, visit)?;
+            if damage.is_some() {
+                return Ok(damage);
+            }
+        }
+        Ok(None)
+    }
+
     /// Returns the item of a record, or `None` if it is none.
     fn item<'a>(
         &'a mut self,
@@ -129,12 +206,17 @@ impl Known {
         data: &'a [u8],
     ) -> Result<Option<Item<'a>>, RecordingError> {
         let malformed = || RecordingError::Malformed(opcode);
+        let len = data.len();
+        if matches!(opcode, op::CHANNEL | op::METADATA) && len > MAX_PAIRS {
+            let len = len as u64;
+            return Err(McapError::RecordTooLarge { opcode, len }.into());
+        }
         match opcode {
             op::SCHEMA => {
                 let (header, text) = fields::schema(data).ok_or_else(malformed)?;
                 // A repetition has the same data.
                 if !self.schemas.contains_key(&header.id) {
-                    self.count(data.len())?;
+                    self.count(len)?;
                     let data = text.to_vec();
                     self.schemas.insert(header.id, FileSchema { header, data });
                 }
@@ -143,7 +225,7 @@ impl Known {
             op::CHANNEL => {
                 let channel = fields::channel(data).ok_or_else(malformed)?;
                 if !self.channels.contains_key(&channel.id) {
-                    self.count(data.len())?;
+                    self.count(len.saturating_add(channel.metadata.len() * PAIR))?;
                     self.channels.insert(channel.id, channel);
                 }
                 Ok(None)
@@ -177,3 +259,6 @@ impl Known {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

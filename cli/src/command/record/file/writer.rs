@@ -1,8 +1,10 @@
 //! Writes recordings: chunks that are complete on the disk at short intervals, and files that are split.
 
 use std::collections::{BTreeMap, HashMap};
+use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -19,6 +21,10 @@ use super::{RecordingError, Schema};
 const CHUNK: u64 = 1 << 20;
 /// Level of the compression with zstd: the fastest of the positive ones.
 const LEVEL: u32 = 1;
+/// Number of channels from which on values of further topics are not recorded. The format has at most 65,535.
+const MAX_CHANNELS: usize = 4096;
+/// Number of digits of a date such as 20260301. A file with a date in its name is none of a split recording.
+const DATE: usize = 8;
 /// Bytes that are collected before a write.
 const BUFFER: usize = 256 << 10;
 
@@ -42,7 +48,8 @@ pub(in crate::command) struct RecordingFile {
     writer: Writer<BufWriter<Counted>>,
     file: Arc<File>,
     written: Arc<AtomicU64>,
-    channels: HashMap<String, u16>,
+    /// By topic and encoding: names of agents and of topics can make equal topics.
+    channels: HashMap<String, HashMap<String, u16>>,
 }
 
 impl RecordingFile {
@@ -79,8 +86,8 @@ impl RecordingFile {
         stamp: Stamp,
         data: &[u8],
     ) -> Result<(), RecordingError> {
-        let channel_id = match self.channels.get(target.topic) {
-            Some(channel) => *channel,
+        let channel_id = match self.channel(target.topic, target.encoding) {
+            Some(channel) => channel,
             None => self.add_channel(target)?,
         };
         let header = MessageHeader {
@@ -91,6 +98,16 @@ impl RecordingFile {
         };
         self.writer.write_to_known_channel(&header, data)?;
         Ok(())
+    }
+
+    /// Whether a message with this encoding needs no channel beyond [`MAX_CHANNELS`].
+    pub(in crate::command) fn has_room(&self, topic: &str, encoding: &str) -> bool {
+        let channels = || self.channels.values().map(HashMap::len).sum::<usize>();
+        self.channel(topic, encoding).is_some() || channels() < MAX_CHANNELS
+    }
+
+    fn channel(&self, topic: &str, encoding: &str) -> Option<u16> {
+        self.channels.get(topic)?.get(encoding).copied()
     }
 
     fn add_channel(&mut self, target: Target<'_>) -> Result<u16, RecordingError> {
@@ -106,7 +123,8 @@ impl RecordingFile {
             topic, encoding, ..
         } = target;
         let channel = self.writer.add_channel(schema, topic, encoding, &none)?;
-        self.channels.insert(topic.to_owned(), channel);
+        let channels = self.channels.entry(topic.to_owned()).or_default();
+        channels.insert(encoding.to_owned(), channel);
         Ok(channel)
     }
 
@@ -135,6 +153,11 @@ impl RecordingFile {
     pub(in crate::command) fn flush(&mut self) -> Result<Arc<File>, RecordingError> {
         self.writer.flush()?;
         Ok(Arc::clone(&self.file))
+    }
+
+    /// Whether another program has removed the file.
+    pub(in crate::command) fn is_removed(&self) -> Result<bool, RecordingError> {
+        Ok(self.file.metadata()?.nlink() == 0)
     }
 
     /// Writes the index and synchronizes the file with the disk. Returns the length of the file.
@@ -196,9 +219,7 @@ impl Split {
     }
 
     fn parts(&self) -> (String, String) {
-        let text = |part: Option<&std::ffi::OsStr>| {
-            part.unwrap_or_default().to_string_lossy().into_owned()
-        };
+        let text = |part: Option<&OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
         let extension = match self.path.extension() {
             Some(extension) => format!(".{}", extension.to_string_lossy()),
             None => String::new(),
@@ -221,8 +242,12 @@ impl Split {
                 .strip_prefix(&stem)
                 .and_then(|rest| rest.strip_prefix('_'))
                 .and_then(|rest| rest.strip_suffix(&extension))
-                .filter(|digits| digits.len() >= 4 && digits.bytes().all(|it| it.is_ascii_digit()));
-            numbers.extend(number.and_then(|digits| digits.parse::<u64>().ok()));
+                .filter(|digits| {
+                    digits.len() < DATE && digits.bytes().all(|it| it.is_ascii_digit())
+                })
+                .and_then(|digits| digits.parse::<u64>().ok())
+                .filter(|number| self.numbered(*number).file_name() == Some(OsStr::new(&*name)));
+            numbers.extend(number);
         }
         numbers.sort_unstable();
         Ok(numbers)

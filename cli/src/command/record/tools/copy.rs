@@ -9,6 +9,7 @@ use mcap::records::MessageHeader;
 use super::super::file::reader::{End, Item};
 use super::super::file::writer::RecordingFile;
 use super::super::file::{self, RecordingError};
+use super::super::file_name;
 use super::super::recorder::failed;
 use super::read_file;
 use super::select::{Selection, Selector};
@@ -27,7 +28,7 @@ pub(in crate::command) struct Repair {
     file: PathBuf,
 
     /// File to write
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE", value_parser = file_name())]
     output: PathBuf,
 }
 
@@ -45,7 +46,7 @@ pub(in crate::command) struct Filtered {
     file: PathBuf,
 
     /// File to write
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE", value_parser = file_name())]
     output: PathBuf,
 
     #[command(flatten)]
