@@ -31,11 +31,16 @@ const PACE: Duration = Duration::from_millis(200);
 const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
 
 /// The parts of the page: path, media type, content.
-const PARTS: [(&str, &str, &str); 10] = [
+const PARTS: [(&str, &str, &str); 11] = [
     (
         "/",
         "text/html; charset=utf-8",
         include_str!("assets/index.html"),
+    ),
+    (
+        "/api/openapi.json",
+        "application/json",
+        include_str!("assets/openapi.json"),
     ),
     ("/style.css", CSS, include_str!("assets/style.css")),
     ("/main.js", JAVASCRIPT, include_str!("assets/main.js")),
