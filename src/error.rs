@@ -33,7 +33,9 @@ pub use crate::domain::coalition::CoalitionError;
 use crate::domain::files::DomainDir;
 pub use crate::domain::files::DomainDirError;
 #[cfg(feature = "web")]
-pub use crate::web::{TokenError, WebError};
+pub use crate::web::error::WebError;
+#[cfg(feature = "web")]
+pub use crate::web::token::TokenError;
 
 /// The error of [`Domain::open`](crate::Domain::open) and of opening a gateway or a watcher.
 #[derive(Debug, thiserror::Error)]

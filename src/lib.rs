@@ -154,7 +154,7 @@ pub mod topics;
 #[cfg(any(feature = "protocols", feature = "secure"))]
 mod wall_clock;
 #[cfg(feature = "web")]
-mod web;
+pub mod web;
 
 pub use agent::delivery::{Deliveries, Delivery};
 pub use agent::incoming::Incoming;

@@ -13,8 +13,8 @@ use fipa_sds::Entry;
 use fipa_transport::Incarnation;
 
 pub use crate::domain::report::{
-    Connected, ContestedName, LinkSecurity, LostHost, Namesakes, RefusedConnection, RefusedDial,
-    RouteReport, StaticPeer,
+    Connected, ContestedName, HttpListener, LinkSecurity, LostHost, Namesakes, RefusedConnection,
+    RefusedDial, RouteReport, StaticPeer,
 };
 use crate::error::{ReceiveError, SendError};
 use crate::{Agent, Deliveries, Message};

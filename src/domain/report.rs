@@ -1,7 +1,7 @@
 //! The report of a process about the routes of its letters.
 
 use std::collections::BTreeMap;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -55,6 +55,19 @@ pub struct RouteReport {
     /// gateway. See [`Config::values`](crate::Config::values).
     #[serde(default)]
     pub configuration: BTreeMap<String, String>,
+    /// The HTTP listener; `None` unless the service is a gateway with `http.listen`.
+    #[serde(default)]
+    pub http: Option<HttpListener>,
+}
+
+/// The HTTP listener of a gateway.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct HttpListener {
+    /// The address of `http.listen`, with the port that the system has chosen if the configuration leaves it open.
+    pub address: SocketAddr,
+    /// The file with the token that clients send.
+    pub token_file: String,
 }
 
 /// A name that an agent of this host and an agent of another host have.

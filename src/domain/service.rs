@@ -295,6 +295,7 @@ impl Service {
             contested: Vec::new(),
             namesakes: Vec::new(),
             configuration: BTreeMap::new(),
+            http: None,
         }
     }
 

@@ -27,8 +27,8 @@ use std::collections::BTreeMap;
 use std::fmt;
 #[cfg(feature = "web")]
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use fipa_acl::{ErrorChain, escape};
@@ -71,10 +71,13 @@ use crate::domain::directory_view::DirectoryView;
 #[cfg(feature = "web")]
 use crate::domain::files::DomainDir;
 use crate::domain::process::Owner;
+use crate::domain::report::HttpListener;
 use crate::domain::service::{Role, Service};
 use crate::error::OpenError;
 #[cfg(feature = "web")]
 use crate::error::WebError;
+#[cfg(feature = "web")]
+use crate::web::Pages;
 use crate::{AgentId, Config};
 
 /// A running gateway. Ends when [`close`](Self::close) is called or the value is dropped.
@@ -91,9 +94,8 @@ pub struct Gateway {
     state: Arc<StateFile>,
     /// The letters of the gateway to itself that have arrived.
     arrivals: Arrivals,
-    /// The address of `http.listen`, with its port.
-    #[cfg(feature = "web")]
-    web_address: Option<std::net::SocketAddr>,
+    /// The HTTP listener, as soon as it is open.
+    http: Arc<OnceLock<HttpListener>>,
     tasks: Vec<JoinHandle<()>>,
 }
 
@@ -109,6 +111,30 @@ impl Gateway {
     /// Fails when the configuration, the domain's directory or a configured address cannot be used,
     /// or when the domain already has a gateway.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
+        #[cfg(feature = "web")]
+        return Self::open_with_pages(config, Pages::default()).await;
+        #[cfg(not(feature = "web"))]
+        match config.http.listen.is_empty() {
+            true => Self::open_for_letters(config).await,
+            false => Err(OpenError::NoFeature {
+                key: "http.listen",
+                feature: "web",
+            }),
+        }
+    }
+
+    /// Starts the gateway as [`open`](Self::open) does, and shows these pages at `http.listen`, if that is set.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open).
+    #[cfg(feature = "web")]
+    pub async fn open_with_pages(config: &Config, pages: Pages) -> Result<Self, OpenError> {
+        let mut gateway = Self::open_for_letters(config).await?;
+        gateway.serve_web(config, pages)?;
+        Ok(gateway)
+    }
+
+    async fn open_for_letters(config: &Config) -> Result<Self, OpenError> {
         let runtime = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let config = config.clone();
         let opened = background::run(&runtime, move |cancellation| {
@@ -187,8 +213,7 @@ impl Gateway {
             exchange,
             state,
             arrivals: Arrivals::default(),
-            #[cfg(feature = "web")]
-            web_address: None,
+            http: Arc::default(),
             tasks: Vec::new(),
         };
         // The queue is created first, because letters arrive as soon as the name is registered.
@@ -220,7 +245,7 @@ impl Gateway {
         gateway.tasks.push(tokio::spawn(follow));
         #[cfg(feature = "secure")]
         let contacted = Arc::clone(&known_peers.directory);
-        gateway.open_for_letters(
+        gateway.accept_letters(
             config,
             known,
             known_peers,
@@ -228,7 +253,6 @@ impl Gateway {
             refused_dials,
             predecessor,
         )?;
-        gateway.serve_web(config)?;
         #[cfg(feature = "secure")]
         gateway.tasks.extend(guard.map(|guard| {
             let (service, exchange) = (Arc::clone(&gateway.service), Arc::clone(&gateway.exchange));
@@ -241,7 +265,7 @@ impl Gateway {
 
     /// Starts to answer letters, to exchange directories with neighbors, and to keep in touch with
     /// the static peers.
-    fn open_for_letters(
+    fn accept_letters(
         &mut self,
         config: &Config,
         known: Arc<MergedDirectory>,
@@ -267,6 +291,7 @@ impl Gateway {
             arrivals: self.arrivals.clone(),
             known_peers,
             configuration: Arc::clone(&self.configuration),
+            http: Arc::clone(&self.http),
             refusals,
             refused_dials,
             namesakes,
@@ -299,15 +324,23 @@ impl Gateway {
 
     /// Answers requests at `http.listen`.
     #[cfg(feature = "web")]
-    fn serve_web(&mut self, config: &Config) -> Result<(), OpenError> {
+    fn serve_web(&mut self, config: &Config, pages: Pages) -> Result<(), WebError> {
         use crate::web::{Listener, Token};
         let http = &config.http;
         if http.listen.is_empty() {
             return Ok(());
         }
-        let token = Token::load(&self.web_token_file()).map_err(WebError::Token)?;
+        let token_file = match http.token_file.is_empty() {
+            true => self.service.dir.part(DomainDir::TOKEN),
+            false => PathBuf::from(&http.token_file),
+        };
+        let token = Token::load(&token_file).map_err(WebError::Token)?;
         let listener = Listener::open(&http.listen, &http.names, token)?;
-        self.web_address = Some(listener.address());
+        // Set only here.
+        let _ = self.http.set(HttpListener {
+            address: listener.address(),
+            token_file: token_file.to_string_lossy().into_owned(),
+        });
         let shown = metrics::Shown {
             service: Arc::clone(&self.service),
             view: Arc::clone(&self.view),
@@ -316,20 +349,9 @@ impl Gateway {
             discovery_problem: self.discovery_problem(),
             shown: Mutex::default(),
         };
-        let serving = listener.serve(Arc::new(shown));
+        let serving = listener.serve(Arc::new(shown), pages);
         self.tasks.push(tokio::spawn(serving));
         Ok(())
-    }
-
-    #[cfg(not(feature = "web"))]
-    fn serve_web(&mut self, config: &Config) -> Result<(), OpenError> {
-        match config.http.listen.is_empty() {
-            true => Ok(()),
-            false => Err(OpenError::NoFeature {
-                key: "http.listen",
-                feature: "web",
-            }),
-        }
     }
 
     fn means(&self) -> Result<Means, OpenError> {
@@ -448,21 +470,10 @@ impl Gateway {
         }
     }
 
-    /// Returns the address at which the gateway answers Prometheus and health checks, if `http.listen` is set.
-    #[cfg(feature = "web")]
+    /// Returns the listener for metrics and pages, if `http.listen` is set.
     #[must_use]
-    pub fn web_address(&self) -> Option<std::net::SocketAddr> {
-        self.web_address
-    }
-
-    /// Returns the file with the token that clients of that address send.
-    #[cfg(feature = "web")]
-    #[must_use]
-    pub fn web_token_file(&self) -> PathBuf {
-        match self.config.http.token_file.is_empty() {
-            true => self.service.dir.part(DomainDir::TOKEN),
-            false => PathBuf::from(&self.config.http.token_file),
-        }
+    pub fn http(&self) -> Option<&HttpListener> {
+        self.http.get()
     }
 
     /// Returns the current problem of the discovery of other hosts, if there is one, and its changes.

@@ -1,42 +1,53 @@
-//! The HTTP listener of the gateway: metrics for Prometheus, and checks of its health.
+//! The HTTP listener of the gateway: metrics for Prometheus, checks of its health, and pages of the program.
 //!
 //! | path | answer |
 //! |---|---|
 //! | `/metrics` | the counters of all processes of the domain on this host, in the text format of Prometheus |
 //! | `/healthz` | `ok` as long as the gateway runs |
 //! | `/readyz` | `ok` if letters can pass, otherwise the reason with status 503 |
+//! | `/api/session` | `POST` of the token begins the session of a browser, `DELETE` ends it |
+//! | all others | the [`Pages`] of the program |
 //!
-//! Each request needs the token (`token`): any user of the host can connect to a loopback address, and so can any web
-//! page that a browser on the host shows. `Host` must be an address, `localhost` or a name of the configuration, so that
-//! no page reaches the listener under a name of its own (DNS rebinding).
+//! Each request for values needs the token or a session: any user of the host can connect to a loopback address, and so
+//! can any web page that a browser on the host shows. `Host` must be an address, `localhost` or a name of the
+//! configuration, so that no page reaches the listener under a name of its own (DNS rebinding).
 //!
-//! The gateway has the values; this room knows only [`Source`].
+//! The gateway has the values; this room knows only `Source`.
 
+pub(crate) mod error;
+mod pages;
 mod prometheus;
 mod requests;
-mod token;
+mod sessions;
+pub(crate) mod token;
 
 use std::future::Future;
 use std::net::SocketAddr;
-use std::pin::Pin;
+use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::time::Duration;
 
+use axum::Extension;
 use fipa_transport::log_limit;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use rustix::net::sockopt::set_tcp_user_timeout;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
+use self::error::WebError;
+pub use self::pages::{KeepOpen, Pages};
 pub(crate) use self::prometheus::Families;
 pub(crate) use self::token::Token;
-pub use self::token::TokenError;
 
 /// Maximum number of connections at the same time. Others wait.
 const MAX_CONNECTIONS: usize = 32;
 
-/// Time for a connection: one request and its answer.
+/// Time after which a connection ends whose client takes nothing that it is sent.
+const TAKE_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// Time for a connection: one request and its answer, unless the answer has no end.
 const CONNECTION_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Time for the head of a request.
@@ -61,23 +72,6 @@ pub(crate) trait Source: Send + Sync + 'static {
     /// # Errors
     /// The reason why they cannot.
     fn readiness(&self) -> Pin<Box<dyn Future<Output = Result<(), String>> + Send + '_>>;
-}
-
-/// The error if the listener cannot be opened.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum WebError {
-    /// The address cannot be used.
-    #[error("cannot listen at {address} (key http.listen)")]
-    Listen {
-        /// The address.
-        address: String,
-        /// The error of the operating system.
-        source: std::io::Error,
-    },
-    /// The token cannot be used.
-    #[error(transparent)]
-    Token(#[from] TokenError),
 }
 
 /// A listener that does not answer yet.
@@ -113,8 +107,8 @@ impl Listener {
     }
 
     /// Answers requests until it is aborted.
-    pub(crate) async fn serve(self, source: Arc<dyn Source>) {
-        let routes = requests::routes(source, self.token, self.names);
+    pub(crate) async fn serve(self, source: Arc<dyn Source>, pages: Pages) {
+        let routes = requests::routes(source, self.token, self.names, pages);
         let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
         // Dropped with this future: the connections end with the gateway.
         let mut connections = JoinSet::new();
@@ -133,11 +127,12 @@ impl Listener {
             };
             let routes = routes.clone();
             connections.spawn(async move {
-                let answered = tokio::time::timeout(CONNECTION_TIMEOUT, answer(stream, routes));
-                match answered.await {
-                    Ok(Ok(())) => {}
-                    Ok(Err(error)) => tracing::debug!(%error, "a connection at http.listen failed"),
-                    Err(_) => tracing::debug!("a connection at http.listen took too long"),
+                match answer(stream, routes).await {
+                    Some(Ok(())) => {}
+                    Some(Err(error)) => {
+                        tracing::debug!(%error, "a connection at http.listen failed")
+                    }
+                    None => tracing::debug!("a connection at http.listen took too long"),
                 }
                 drop(place);
             });
@@ -145,17 +140,29 @@ impl Listener {
     }
 }
 
-/// Answers one request.
-async fn answer(stream: TcpStream, routes: axum::Router) -> Result<(), hyper::Error> {
-    hyper::server::conn::http1::Builder::new()
-        .timer(TokioTimer::new())
-        .header_read_timeout(HEAD_TIMEOUT)
-        .max_buf_size(MAX_HEAD)
-        .keep_alive(false)
-        // A client may close its side after the request, as `nc -N` does.
-        .half_close(true)
-        .serve_connection(TokioIo::new(stream), TowerToHyperService::new(routes))
-        .await
+/// Answers one request. Returns `None` if its time is over.
+async fn answer(stream: TcpStream, routes: axum::Router) -> Option<Result<(), hyper::Error>> {
+    let timeout = u32::try_from(TAKE_TIMEOUT.as_millis()).unwrap_or(u32::MAX);
+    if let Err(error) = set_tcp_user_timeout(&stream, timeout) {
+        tracing::debug!(%error, "a connection at http.listen has no timeout for sent data");
+    }
+    let keep_open = KeepOpen::default();
+    let routes = routes.layer(Extension(keep_open.clone()));
+    let mut connection = pin!(
+        hyper::server::conn::http1::Builder::new()
+            .timer(TokioTimer::new())
+            .header_read_timeout(HEAD_TIMEOUT)
+            .max_buf_size(MAX_HEAD)
+            .keep_alive(false)
+            // A client may close its side after the request, as `nc -N` does.
+            .half_close(true)
+            .serve_connection(TokioIo::new(stream), TowerToHyperService::new(routes))
+    );
+    match tokio::time::timeout(CONNECTION_TIMEOUT, &mut connection).await {
+        Ok(answered) => Some(answered),
+        Err(_) if keep_open.is_kept() => Some(connection.await),
+        Err(_) => None,
+    }
 }
 
 #[cfg(test)]
@@ -200,7 +207,8 @@ mod tests {
         let listener = Listener::open("127.0.0.1:0", &[], Token::for_tests()).unwrap();
         let address = listener.address();
         let source = Arc::new(Stuck::default());
-        let serving = tokio::spawn(listener.serve(Arc::clone(&source) as Arc<dyn Source>));
+        let serving =
+            tokio::spawn(listener.serve(Arc::clone(&source) as Arc<dyn Source>, Pages::default()));
         let mut client = TcpStream::connect(address).await.unwrap();
         let request = "GET /readyz HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer 0123456789abcdef\r\n\r\n";
         client.write_all(request.as_bytes()).await.unwrap();

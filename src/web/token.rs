@@ -71,6 +71,16 @@ pub enum TokenError {
     },
 }
 
+/// Returns a new secret of 128 bits, as hexadecimal digits.
+pub(super) fn random_text() -> io::Result<String> {
+    let mut bytes = [0; RANDOM];
+    getrandom::fill(&mut bytes).map_err(io::Error::other)?;
+    Ok(bytes.iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    }))
+}
+
 impl Token {
     /// Reads the token in a file, or creates the file with a new one, which only its owner may read.
     pub(crate) fn load(path: &Path) -> Result<Self, TokenError> {
@@ -130,13 +140,7 @@ impl Token {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}
             Err(error) => return Err(error),
         }
-        let mut bytes = [0; RANDOM];
-        getrandom::fill(&mut bytes).map_err(io::Error::other)?;
-        let mut token = bytes.iter().fold(String::new(), |mut text, byte| {
-            let _ = write!(text, "{byte:02x}");
-            text
-        });
-        token.push('\n');
+        let token = random_text()? + "\n";
         durable::create(path, token.as_bytes(), 0o600)
     }
 

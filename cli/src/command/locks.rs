@@ -207,7 +207,8 @@ fn cells(status: &ResourceStatus, with_all: bool) -> [String; 5] {
     ]
 }
 
-fn in_json(status: &ResourceStatus) -> Value {
+/// The object of a resource.
+pub(super) fn in_json(status: &ResourceStatus) -> Value {
     json!({
         "resource": status.resource,
         "owner": status.owner,

@@ -10,6 +10,7 @@ mod coalition;
 mod completions;
 mod config;
 mod content;
+mod dashboard;
 mod decode;
 mod demo;
 mod df;
@@ -69,6 +70,7 @@ pub(crate) enum Command {
     Reload(reload::Arguments),
     Watch(Box<watch::Arguments>),
     Top(top::Arguments),
+    Dashboard(dashboard::Arguments),
     Record(Box<record::Arguments>),
     Replay(Box<replay::Arguments>),
     Demo(demo::Arguments),
@@ -113,6 +115,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Reload(arguments) => reload::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Top(arguments) => top::run(arguments, global),
+        Command::Dashboard(arguments) => dashboard::run(arguments, global),
         Command::Record(arguments) => record::run(*arguments, global),
         Command::Replay(arguments) => replay::run(&arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),

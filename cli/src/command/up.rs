@@ -2,11 +2,13 @@
 
 use clap::Args;
 use fipa::admin::keys::{Certificate, Keys};
+use fipa::admin::routes::HttpListener;
 use fipa::config::{ConfigError, Reloaded};
 use fipa::{Config, Gateway, log_limit};
 use fipa_acl::{escape, escape_name};
 use serde_json::{Value, json};
 
+use crate::command::dashboard::Dashboard;
 use crate::command::record::fleet::service::RecorderService;
 use crate::membership::{self, SignalRequest, Stop};
 use crate::options::{self, Global};
@@ -62,7 +64,8 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let opened = Gateway::open(config).await;
+    let (dashboard, pages) = Dashboard::start(config);
+    let opened = Gateway::open_with_pages(config, pages).await;
     let mut gateway = opened.map_err(|error| membership::not_joined(error, config))?;
     let mut problems = gateway.discovery_problem();
     let mut problem = problems.borrow_and_update().clone();
@@ -126,6 +129,7 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
     if let Some(recorder) = recorder {
         recorder.close().await;
     }
+    dashboard.close().await;
     gateway.close().await;
     Ok(())
 }
@@ -158,11 +162,16 @@ fn ready(
     for location in gateway.locations() {
         text.push_str(&format!("  listening on {location}\n"));
     }
-    if let Some(address) = gateway.web_address() {
-        let token = gateway.web_token_file();
-        let token = escape(&token.to_string_lossy()).into_owned();
+    if let Some(HttpListener {
+        address,
+        token_file,
+        ..
+    }) = gateway.http()
+    {
+        let token = escape(token_file);
         text.push_str(&format!(
-            "  metrics at http://{address}/metrics, with the token in {token}\n"
+            "  metrics at http://{address}/metrics, with the token in {token}\n  \
+               dashboard: run `fipa dashboard` for its link\n"
         ));
     }
     if let Some(recorder) = recorder {
@@ -233,10 +242,7 @@ fn ready_json(
         "incarnation": gateway.incarnation(),
         "domain": config.domain,
         "locations": locations.collect::<Vec<_>>(),
-        "http": gateway.web_address().map(|address| json!({
-            "address": address.to_string(),
-            "token_file": gateway.web_token_file().to_string_lossy(),
-        })),
+        "http": gateway.http(),
         "recorder": recorder,
         "discovery": discovery,
         "security": {

@@ -9,7 +9,7 @@ pub(crate) mod questions;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::error::Error;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape, escape_name};
@@ -31,8 +31,9 @@ use super::neighbors::Neighbors;
 use super::self_check::Arrivals;
 use crate::admin::contact::{self, Introduced};
 use crate::admin::routes;
+use crate::domain::presence;
+use crate::domain::report::{self, HttpListener};
 use crate::domain::service::Service;
-use crate::domain::{presence, report};
 
 /// Deadline for the delivery of an answer.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
@@ -51,6 +52,8 @@ pub(crate) struct GatewayAgent {
     pub(super) known_peers: Arc<KnownPeers>,
     /// The values of the configuration in use, by key.
     pub(super) configuration: Arc<Mutex<BTreeMap<String, String>>>,
+    /// The HTTP listener, as soon as it is open.
+    pub(super) http: Arc<OnceLock<HttpListener>>,
     /// The connections that were refused because of keys or versions.
     pub(super) refusals: Refusals,
     /// The connections of this gateway that peers refused.
@@ -274,6 +277,7 @@ impl GatewayAgent {
             contested: self.exchange.contested(),
             namesakes: self.namesakes.found(Instant::now()),
             configuration: self.configuration.lock().clone(),
+            http: self.http.get().cloned(),
             locations: self.service.shown_locations(),
             ..self.service.report(&entries)
         };

@@ -2,8 +2,8 @@
 
 mod capture;
 pub(super) mod file;
-mod hosts;
 pub(super) mod fleet;
+mod hosts;
 mod locks;
 mod note;
 mod recorder;

@@ -28,12 +28,14 @@ use tokio::time::MissedTickBehavior;
 
 use self::meter::{Meter, Observed};
 use self::peers::Peers;
+pub(in crate::command) use self::print::{agent_object, peer_object, totals_object};
 use self::screen::Palette;
-use self::table::{Column, Snapshot, Surroundings};
+pub(in crate::command) use self::table::{AgentRow, Snapshot};
+use self::table::{Column, Surroundings};
 use self::terminal::Screen;
 use self::view::{Filter, View};
 use crate::command::watch::OBSERVATION_DELAY;
-use crate::command::watch::checker::{self, Checker, Earlier, Letter};
+use crate::command::watch::checker::{self, CheckResult, Checker, Earlier, Letter};
 use crate::complete;
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
@@ -164,22 +166,12 @@ async fn show(
     let watcher = Watcher::open(config, WatchOptions::default()).await;
     let watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
     let (mut target, keys) = Target::open(&arguments)?;
-    let now = Instant::now();
     let window = match target {
         Target::Screen(..) => arguments.every.max(MIN_WINDOW),
         Target::Text | Target::Json => arguments.every,
     };
-    let mut earlier = Earlier::default();
-    earlier.add(watcher.directory());
-    let mut observer = Observer {
-        meter: Meter::new(now, window),
-        peers: Peers::default(),
-        checker,
-        earlier,
-        asker: asker.name().to_owned(),
-        domain: config.domain.clone(),
-        host: output::host_name(),
-    };
+    let own = vec![asker.name().to_owned()];
+    let mut observer = Observer::new(window, checker, own, config, &watcher);
     let (sender, reports) = mpsc::channel(1);
     let asking = tokio::spawn(ask(asker, sender));
     let mut sources = Sources {
@@ -207,9 +199,10 @@ struct Sources {
 }
 
 /// The report of the gateway, `None` if none is running, or the problem.
-type GatewayReport = Result<Option<RouteReport>, String>;
+pub(in crate::command) type GatewayReport = Result<Option<RouteReport>, String>;
 
-async fn ask(agent: Agent, reports: mpsc::Sender<GatewayReport>) {
+/// Asks the gateway for its report again and again.
+pub(in crate::command) async fn ask(agent: Agent, reports: mpsc::Sender<GatewayReport>) {
     loop {
         // The routes to all agents could be many; the report needs to have none.
         let report = membership::report_to(&agent, Some(agent.name())).await;
@@ -331,19 +324,45 @@ fn terminal_failure(error: &io::Error) -> Failure {
 }
 
 /// Counts the observed letters.
-struct Observer {
+pub(in crate::command) struct Observer {
     meter: Meter,
     peers: Peers,
     checker: Checker,
     earlier: Earlier,
-    /// The name of the agent that asks the gateway for reports. Its letters do not count.
-    asker: String,
+    /// The names of the agents of this program. Their letters do not count.
+    own: Vec<String>,
     domain: String,
     host: String,
 }
 
 impl Observer {
-    fn event(&mut self, event: &Event, watcher: &Watcher) {
+    /// Begins now. Rates and percentiles cover a window of this length.
+    pub(in crate::command) fn new(
+        window: Duration,
+        checker: Checker,
+        own: Vec<String>,
+        config: &Config,
+        watcher: &Watcher,
+    ) -> Self {
+        let mut earlier = Earlier::default();
+        earlier.add(watcher.directory());
+        Self {
+            meter: Meter::new(Instant::now(), window),
+            peers: Peers::default(),
+            checker,
+            earlier,
+            own,
+            domain: config.domain.clone(),
+            host: output::host_name(),
+        }
+    }
+
+    /// Handles an event. Returns the result of the check of a new letter, unless it is of this program.
+    pub(in crate::command) fn event(
+        &mut self,
+        event: &Event,
+        watcher: &Watcher,
+    ) -> Option<CheckResult> {
         let now = Instant::now();
         let directory = watcher.directory();
         match event {
@@ -353,6 +372,7 @@ impl Observer {
                 let host = host.as_deref();
                 let observed = Observed { passage, host };
                 self.meter.letter(now, &observed, checked.is_violation());
+                return Some(checked);
             }
             Event::Later(passage) | Event::Confirmed(passage) if !self.is_own(passage) => {
                 let host = host_of(passage, directory);
@@ -366,20 +386,25 @@ impl Observer {
             }
             _ => {}
         }
+        None
     }
 
-    fn is_own(&self, passage: &Passage) -> bool {
-        *passage.receiver == *self.asker || passage.sender() == Some(&self.asker)
+    /// Whether a letter is from or to an agent of this program.
+    pub(in crate::command) fn is_own(&self, passage: &Passage) -> bool {
+        let is_own = |name: &str| self.own.iter().any(|own| own == name);
+        is_own(&passage.receiver) || passage.sender().is_some_and(is_own)
     }
 
-    fn report(&mut self, report: GatewayReport) {
+    /// Takes the report of the gateway, or the reason why there is none.
+    pub(in crate::command) fn report(&mut self, report: GatewayReport) {
         match report {
             Ok(report) => self.peers.handle_report(Instant::now(), report),
             Err(problem) => self.peers.handle_failure(problem),
         }
     }
 
-    fn snapshot(&mut self, watcher: &Watcher) -> Snapshot {
+    /// Returns the domain as it is now.
+    pub(in crate::command) fn snapshot(&mut self, watcher: &Watcher) -> Snapshot {
         let (now, time) = (Instant::now(), SystemTime::now());
         self.checker.pass(time - OBSERVATION_DELAY);
         let directory = watcher.directory();

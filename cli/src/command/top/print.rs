@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use fipa::Matcher;
 use fipa_acl::{escape, escape_name};
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use super::peers::{PeerRow, PeerState};
 use super::table::{self, AgentRow, Column, Header, Order, PEER_TITLES, Snapshot};
@@ -65,6 +65,30 @@ fn head(header: &Header) -> String {
 
 /// The domain as a JSON object.
 pub(super) fn json(snapshot: &Snapshot, order: Order, shown: Option<&Matcher>) -> Value {
+    let agents = snapshot.sorted(order, shown).into_iter().map(agent_object);
+    let agents = agents.collect::<Vec<_>>();
+    let mut object = totals_object(snapshot);
+    let mut put = |key: &str, value: Value| object.insert(key.to_owned(), value);
+    put(
+        "time",
+        output::rfc3339(snapshot.header.surroundings.time).into(),
+    );
+    put("agents", agents.into());
+    put("others", snapshot.others.as_ref().map(agent_object).into());
+    put(
+        "hosts",
+        snapshot
+            .peers
+            .iter()
+            .map(peer_object)
+            .collect::<Vec<_>>()
+            .into(),
+    );
+    Value::Object(object)
+}
+
+/// The values of the whole domain, without the time.
+pub(in crate::command) fn totals_object(snapshot: &Snapshot) -> Map<String, Value> {
     let Header {
         surroundings,
         rates,
@@ -72,9 +96,8 @@ pub(super) fn json(snapshot: &Snapshot, order: Order, shown: Option<&Matcher>) -
         latency,
         lost,
     } = &snapshot.header;
-    let agents = snapshot.sorted(order, shown).into_iter().map(agent);
-    json!({
-        "time": output::rfc3339(surroundings.time), "domain": surroundings.domain, "host": surroundings.host,
+    let totals = json!({
+        "domain": surroundings.domain, "host": surroundings.host,
         "agents_here": surroundings.here, "agents_elsewhere": surroundings.elsewhere,
         "processes": surroundings.processes, "gateway": surroundings.gateway,
         "problem": surroundings.problem,
@@ -82,13 +105,15 @@ pub(super) fn json(snapshot: &Snapshot, order: Order, shown: Option<&Matcher>) -
         "violations_per_second": rounded(rates.violations),
         "letters": total.sent, "failures": total.failed, "violations": total.violations,
         "median_us": median(*latency), "p99_us": percentile_99(*latency), "lost": lost,
-        "agents": agents.collect::<Vec<_>>(),
-        "others": snapshot.others.as_ref().map(agent),
-        "hosts": snapshot.peers.iter().map(peer).collect::<Vec<_>>(),
-    })
+    });
+    match totals {
+        Value::Object(totals) => totals,
+        _ => Map::new(),
+    }
 }
 
-fn agent(row: &AgentRow) -> Value {
+/// The object of an agent.
+pub(in crate::command) fn agent_object(row: &AgentRow) -> Value {
     let AgentRow {
         name,
         rates,
@@ -105,7 +130,8 @@ fn agent(row: &AgentRow) -> Value {
     })
 }
 
-fn peer(row: &PeerRow) -> Value {
+/// The object of another host.
+pub(in crate::command) fn peer_object(row: &PeerRow) -> Value {
     let (state, time) = match row.state {
         PeerState::Connected(time) => ("connected", Some(time)),
         PeerState::Lost(time) => ("lost", Some(time)),

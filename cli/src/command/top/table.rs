@@ -14,50 +14,50 @@ use crate::output;
 
 /// The domain at one time.
 #[derive(Debug)]
-pub(super) struct Snapshot {
-    pub(super) header: Header,
-    pub(super) agents: Vec<AgentRow>,
+pub(in crate::command) struct Snapshot {
+    pub(in crate::command) header: Header,
+    pub(in crate::command) agents: Vec<AgentRow>,
     /// The letters of all agents without a row; `None` if all agents have one.
-    pub(super) others: Option<AgentRow>,
-    pub(super) peers: Vec<PeerRow>,
+    pub(in crate::command) others: Option<AgentRow>,
+    pub(in crate::command) peers: Vec<PeerRow>,
 }
 
 /// The data of the whole domain that the counters do not have.
 #[derive(Debug, Clone)]
-pub(super) struct Surroundings {
-    pub(super) domain: String,
-    pub(super) host: String,
-    pub(super) time: SystemTime,
+pub(in crate::command) struct Surroundings {
+    pub(in crate::command) domain: String,
+    pub(in crate::command) host: String,
+    pub(in crate::command) time: SystemTime,
     /// Number of agents on this host.
-    pub(super) here: usize,
+    pub(in crate::command) here: usize,
     /// Number of known agents on other hosts.
-    pub(super) elsewhere: usize,
+    pub(in crate::command) elsewhere: usize,
     /// Number of watched processes.
-    pub(super) processes: usize,
+    pub(in crate::command) processes: usize,
     /// The name of the gateway of this host.
-    pub(super) gateway: Option<String>,
+    pub(in crate::command) gateway: Option<String>,
     /// The reason why the data of the gateway are old.
-    pub(super) problem: Option<String>,
+    pub(in crate::command) problem: Option<String>,
 }
 
 /// The data of the whole domain.
 #[derive(Debug)]
-pub(super) struct Header {
-    pub(super) surroundings: Surroundings,
-    pub(super) rates: Rates,
-    pub(super) total: Counts,
-    pub(super) latency: Option<Latency>,
-    pub(super) lost: u64,
+pub(in crate::command) struct Header {
+    pub(in crate::command) surroundings: Surroundings,
+    pub(in crate::command) rates: Rates,
+    pub(in crate::command) total: Counts,
+    pub(in crate::command) latency: Option<Latency>,
+    pub(in crate::command) lost: u64,
 }
 
 /// The letters of an agent.
 #[derive(Debug, Clone)]
-pub(super) struct AgentRow {
-    pub(super) name: String,
-    pub(super) rates: Rates,
-    pub(super) total: Counts,
-    pub(super) latency: Option<Latency>,
-    pub(super) via: Option<Kind>,
+pub(in crate::command) struct AgentRow {
+    pub(in crate::command) name: String,
+    pub(in crate::command) rates: Rates,
+    pub(in crate::command) total: Counts,
+    pub(in crate::command) latency: Option<Latency>,
+    pub(in crate::command) via: Option<Kind>,
 }
 
 impl Snapshot {

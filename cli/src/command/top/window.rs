@@ -19,11 +19,11 @@ pub(super) struct Slots {
 
 /// Numbers of letters.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Counts {
-    pub(super) sent: u64,
-    pub(super) received: u64,
-    pub(super) failed: u64,
-    pub(super) violations: u64,
+pub(in crate::command) struct Counts {
+    pub(in crate::command) sent: u64,
+    pub(in crate::command) received: u64,
+    pub(in crate::command) failed: u64,
+    pub(in crate::command) violations: u64,
 }
 
 impl Counts {
@@ -37,16 +37,16 @@ impl Counts {
 
 /// Letters per second.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Rates {
-    pub(super) sent: f64,
-    pub(super) received: f64,
-    pub(super) failed: f64,
-    pub(super) violations: f64,
+pub(in crate::command) struct Rates {
+    pub(in crate::command) sent: f64,
+    pub(in crate::command) received: f64,
+    pub(in crate::command) failed: f64,
+    pub(in crate::command) violations: f64,
 }
 
 /// Percentiles of delivery times.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Latency {
+pub(in crate::command) struct Latency {
     pub(super) median: Duration,
     pub(super) percentile_99: Duration,
 }

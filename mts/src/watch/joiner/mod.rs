@@ -22,8 +22,11 @@ const HOLD: Duration = Duration::from_millis(40);
 const TIMEOUT: Duration = Duration::from_millis(250);
 /// Maximum number of letters that are held back; beyond it the earliest is reported as it is.
 const MAX_WAITING: usize = 65_536;
-/// Maximum number of reported letters that are remembered, so that none is reported twice.
-const MAX_REPORTED: usize = 65_536;
+/// Maximum number of reported letters that are remembered, because their outcomes may still arrive.
+const MAX_OPEN: usize = 65_536;
+/// Maximum number of other reported letters that are remembered, so that none is reported twice. Each takes some
+/// kilobytes.
+const MAX_SETTLED: usize = 16_384;
 /// Maximum number of outcomes of unknown letters that are remembered.
 const MAX_EARLY: usize = 4096;
 /// Maximum number of processes that are remembered.
@@ -148,8 +151,10 @@ pub struct Joiner {
     letters: HashMap<Key, KnownLetter>,
     /// Letters that are held back, in order.
     waiting: BTreeMap<SendPosition, Key>,
-    /// Letters that were reported, in order.
-    reported: VecDeque<Key>,
+    /// Letters that were reported without an outcome, in order.
+    open: VecDeque<Key>,
+    /// The other letters that were reported, in order.
+    settled: VecDeque<Key>,
     outcomes_before_letters: HashMap<Key, (SystemTime, Outcome, bool)>,
     processes: HashMap<RecordSource, Process>,
     events: VecDeque<Event>,
@@ -396,12 +401,25 @@ impl Joiner {
     }
 
     fn report(&mut self, key: Key) -> Option<Event> {
-        if self.reported.len() >= MAX_REPORTED
-            && let Some(oldest) = self.reported.pop_front()
+        let is_settled = {
+            let known = self.letters.get(&key)?;
+            match known.passage.fate {
+                Fate::Settled(_) => true,
+                // Its sender sends no records.
+                Fate::Taken => known.passage.from_elsewhere,
+                Fate::UnderWay | Fate::Passed(_) => false,
+            }
+        };
+        let (reported, most) = match is_settled {
+            true => (&mut self.settled, MAX_SETTLED),
+            false => (&mut self.open, MAX_OPEN),
+        };
+        if reported.len() >= most
+            && let Some(oldest) = reported.pop_front()
         {
             self.letters.remove(&oldest);
         }
-        self.reported.push_back(key);
+        reported.push_back(key);
         let known = self.letters.get_mut(&key)?;
         self.number += 1;
         known.passage.number = self.number;

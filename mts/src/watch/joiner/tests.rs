@@ -259,17 +259,36 @@ fn a_process_that_sends_invalid_data_is_named() {
 fn memory_for_letters_without_an_outcome_is_bounded() {
     let (mut joiner, now) = (Joiner::new(), Instant::now());
     let mut reported = 0;
-    for sequence in 0..(MAX_WAITING + MAX_REPORTED + 5000) as u64 {
+    for sequence in 0..(MAX_WAITING + MAX_OPEN + 5000) as u64 {
         joiner.handle(now, A, seen(sequence, id(7, sequence), Seen::Sent(None)));
         joiner.handle(now, A, settled(1, id(8, sequence), failed(), true));
         reported += all(&mut joiner, now).len();
     }
-    assert_eq!(reported, MAX_REPORTED + 5000);
-    assert!(joiner.waiting.len() <= MAX_WAITING && joiner.reported.len() <= MAX_REPORTED);
+    assert_eq!(reported, MAX_OPEN + 5000);
+    assert!(joiner.waiting.len() <= MAX_WAITING && joiner.open.len() <= MAX_OPEN);
     assert!(
-        joiner.letters.len() <= MAX_WAITING + MAX_REPORTED
+        joiner.letters.len() <= MAX_WAITING + MAX_OPEN
             && joiner.outcomes_before_letters.len() <= MAX_EARLY
     );
+}
+
+#[test]
+fn letters_with_an_outcome_are_remembered_for_a_while() {
+    let (mut joiner, start) = (Joiner::new(), Instant::now());
+    let count = MAX_SETTLED as u64 + 5000;
+    let mut reported = 0;
+    for sequence in 0..count {
+        joiner.handle(start, A, seen(sequence, id(7, sequence), Seen::Sent(None)));
+        let outcome = delivered(Kind::Shm);
+        joiner.handle(start, A, settled(sequence, id(7, sequence), outcome, true));
+        reported += all(&mut joiner, start + HOLD).len();
+    }
+    assert_eq!(reported as u64, count);
+    assert_eq!(joiner.letters.len(), MAX_SETTLED);
+    // The receiver's record of a letter that was reported long ago adds none.
+    let taken = seen(count, id(7, count - MAX_SETTLED as u64), Seen::Taken(None));
+    joiner.handle(start, B, taken);
+    assert_eq!(joiner.letters.len(), MAX_SETTLED);
 }
 
 /// Letters of several senders, with up to four records each that arrive late, in any order, twice

@@ -14,7 +14,7 @@ const MAX_PEERS: usize = 256;
 
 /// The state of a peer host.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum PeerState {
+pub(in crate::command) enum PeerState {
     /// Connected for this time.
     Connected(Duration),
     /// Not connected for this time.
@@ -25,21 +25,21 @@ pub(super) enum PeerState {
 
 /// A peer host.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct PeerRow {
+pub(in crate::command) struct PeerRow {
     /// Its name, which its gateway claims or proves.
-    pub(super) name: String,
-    pub(super) state: PeerState,
+    pub(in crate::command) name: String,
+    pub(in crate::command) state: PeerState,
     /// The letters of its agents (`sent`) and to its agents (`received`).
-    pub(super) rates: Rates,
+    pub(in crate::command) rates: Rates,
     /// Delivery times of letters to its agents.
-    pub(super) latency: Option<Latency>,
+    pub(in crate::command) latency: Option<Latency>,
     /// The transports that have carried letters to it or, before the first letter, those that can.
-    pub(super) transports: Vec<Kind>,
+    pub(in crate::command) transports: Vec<Kind>,
     /// Whether its connections are encrypted; `None` without a connection.
-    pub(super) encrypted: Option<bool>,
+    pub(in crate::command) encrypted: Option<bool>,
     /// The attempts since the start of the gateway that failed or that the peer rejected. Each was tried again, on
     /// this or another route, or failed its letter.
-    pub(super) retries: u64,
+    pub(in crate::command) retries: u64,
 }
 
 impl PeerRow {

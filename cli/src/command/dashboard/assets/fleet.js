@@ -1,0 +1,134 @@
+// Hosts with their agents, and one agent.
+
+import { clock, element, link, problems, rate, seconds, span, table } from './elements.js';
+import { conversationTable } from './conversations.js';
+import { letterTable } from './letters.js';
+
+const COLUMNS = [
+  { title: 'Agent' },
+  { title: 'Sent/s', class: 'number' },
+  { title: 'Received/s', class: 'number' },
+  { title: 'Delivery', class: 'number optional' },
+  { title: 'Problems' },
+];
+
+function agentRow(row) {
+  const number = (value, isOptional = false) =>
+    element('td', { class: isOptional ? 'number optional' : 'number' }, value);
+  const about = row.members
+    ? `coalition of ${row.members.join(', ')}${row.leader ? `, led by ${row.leader}` : ', without a leader'}`
+    : row.type;
+  const name = element('td', { class: 'name' }, link('agent', row.name),
+    row.ended ? element('span', {}, ` ended ${clock(row.ended)}`) : null,
+    about ? element('div', { class: 'faint' }, about) : null);
+  return element('tr', { class: row.ended ? 'ended' : null }, name,
+    number(rate(row.sent_per_second)), number(rate(row.received_per_second)), number(span(row.median_us), true),
+    element('td', { class: 'bad-text' }, problems(row)));
+}
+
+/** The text about the link with another host. */
+function aboutLink(host) {
+  const parts = [];
+  if (host.state === 'connected') parts.push(`connected for ${seconds(host.seconds)}`);
+  if (host.transports.length) parts.push(host.transports.join(', '));
+  if (host.encrypted !== null) parts.push(host.encrypted ? 'encrypted' : 'not encrypted');
+  if (host.median_us !== null) parts.push(`letters take ${span(host.median_us)} (99 %: ${span(host.p99_us)})`);
+  if (host.retries > 0) parts.push(`${host.retries} failed attempts`);
+  return parts.join(' · ');
+}
+
+class HostCard {
+  constructor(name, isOwn) {
+    this.isOwn = isOwn;
+    this.state = element('p', {});
+    const agents = table(isOwn ? 'Agents of this host' : `Agents of ${name}`, COLUMNS, agentRow);
+    this.agents = agents.rows;
+    this.none = element('p', { class: 'faint' }, 'no agents');
+    this.node = element('section', { class: 'card', 'aria-label': name },
+      element('h2', {}, name, isOwn ? element('span', { class: 'faint' }, ' (this host)') : null),
+      this.state, agents.node, this.none);
+    this.table = agents.node;
+  }
+
+  show(host, rows) {
+    const lost = host && host.state !== 'connected';
+    this.node.classList.toggle('lost', Boolean(lost));
+    this.state.className = lost ? 'bad-text' : '';
+    let text = this.isOwn ? 'the gateway of this page' : 'known without a connection';
+    if (lost) text = host.state === 'lost' ? `LOST ${seconds(host.seconds)} ago` : 'does not answer';
+    else if (host) text = aboutLink(host);
+    if (this.state.textContent !== text) this.state.textContent = text;
+    this.agents.show(rows);
+    this.table.hidden = rows.length === 0;
+    this.none.hidden = rows.length > 0;
+  }
+}
+
+function totals(values) {
+  const shown = [
+    ['Agents', values.agents_here + values.agents_elsewhere],
+    ['Letters/s', rate(values.letters_per_second)],
+    ['Delivery', span(values.median_us) || '–'],
+    ['Failed', values.failures, values.failures > 0],
+    ['Violations', values.violations, values.violations > 0],
+  ];
+  return shown.map(([name, value, isBad]) => element('div', {},
+    element('dt', {}, name), element('dd', { class: isBad ? 'bad-text' : null }, String(value))));
+}
+
+export function fleet() {
+  const numbers = element('dl', { class: 'totals' });
+  const hosts = element('div', { class: 'hosts' });
+  const cards = new Map();
+  const update = ({ domain, hosts: peers = {}, agents = {} }) => {
+    const values = domain?.totals;
+    if (values?.host === undefined) return;
+    document.getElementById('title').textContent = `${values.domain} on ${values.host}`;
+    numbers.replaceChildren(...totals(values));
+    const own = values.gateway ?? values.host;
+    const groups = new Map([[own, []]]);
+    for (const name of Object.keys(peers).sort()) if (name !== own) groups.set(name, []);
+    for (const [key, row] of Object.entries(agents)) {
+      const host = row.here ? own : row.host ?? 'another host';
+      if (!groups.has(host)) groups.set(host, []);
+      groups.get(host).push([key, row]);
+    }
+    for (const [name, rows] of groups) {
+      if (!cards.has(name)) {
+        const card = new HostCard(name, name === own);
+        cards.set(name, card);
+        hosts.append(card.node);
+      }
+      rows.sort(([a], [b]) => (a < b ? -1 : 1));
+      cards.get(name).show(peers[name], rows);
+    }
+    for (const [name, card] of cards) {
+      if (!groups.has(name)) {
+        card.node.remove();
+        cards.delete(name);
+      }
+    }
+  };
+  return { node: element('div', {}, numbers, hosts), path: 'fleet', update };
+}
+
+export function agent(name) {
+  const about = element('dl', { class: 'totals' });
+  const talks = conversationTable();
+  const letters = letterTable();
+  const node = element('div', {},
+    element('h2', {}, name), about,
+    element('h3', {}, 'Conversations'), talks.node, element('h3', {}, 'Letters'), letters.node);
+  const update = (sections) => {
+    const row = sections.agent?.[name];
+    const facts = row
+      ? [['Host', row.host ?? 'this host'], ['Type', row.type || '–'], ['Since', clock(row.registered)],
+        ['State', row.ended ? `ended ${clock(row.ended)}` : 'in the directory', Boolean(row.ended)]]
+      : [['State', 'not in the directory', true]];
+    about.replaceChildren(...facts.map(([title, value, isBad]) => element('div', {},
+      element('dt', {}, title), element('dd', { class: isBad ? 'bad-text' : null }, value))));
+    talks.show(sections.conversations ?? {});
+    letters.show(sections.letters ?? {});
+  };
+  return { node, path: `agent?name=${encodeURIComponent(name)}`, update };
+}

@@ -1,0 +1,185 @@
+//! Observes the domain while pages show it.
+
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use fipa::admin::watch::{WatchOptions, Watcher};
+use fipa::error::ErrorChain;
+use fipa::locks::ResourceStatus;
+use fipa::{Agent, Config, Domain, Incarnation, RegisterOptions};
+use parking_lot::Mutex;
+use tokio::sync::{Notify, mpsc};
+use tokio::time::{Instant, MissedTickBehavior};
+
+use super::picture::{Picture, Wanted};
+use super::view::View;
+use crate::command::top::{self, Observer};
+use crate::command::watch::checker::{self, Checker};
+use crate::membership;
+use crate::report::Failure;
+
+/// Time after the last question for which the domain is observed: a page that is opened again shows what happened.
+const KEPT: Duration = Duration::from_secs(600);
+
+/// Time between two looks into the directory.
+const INTERVAL: Duration = Duration::from_millis(500);
+
+/// Time that rates and percentiles cover.
+const WINDOW: Duration = Duration::from_secs(5);
+
+/// Time between two questions to the owners of locks, and maximum wait for their answers.
+const LOCKS_INTERVAL: Duration = Duration::from_secs(2);
+
+/// Time before the next attempt to observe the domain.
+const RETRY: Duration = Duration::from_secs(5);
+
+/// The state of the domain for all pages.
+pub(super) struct Observation {
+    picture: Mutex<Picture>,
+    /// Wakes the task that observes.
+    wanted: Notify,
+    /// Ends the task that observes.
+    stopped: Notify,
+    last: Mutex<Instant>,
+    last_locks: Mutex<Instant>,
+}
+
+impl Observation {
+    pub(super) fn new() -> Arc<Self> {
+        let now = Instant::now();
+        Arc::new(Self {
+            picture: Mutex::default(),
+            wanted: Notify::new(),
+            stopped: Notify::new(),
+            last: Mutex::new(now),
+            last_locks: Mutex::new(now),
+        })
+    }
+
+    /// Ends the task that observes.
+    pub(super) fn stop(&self) {
+        self.stopped.notify_one();
+    }
+
+    /// Returns a view, and keeps the domain observed.
+    pub(super) fn view(&self, wanted: &Wanted) -> Arc<View> {
+        let now = Instant::now();
+        *self.last.lock() = now;
+        if *wanted == Wanted::Locks {
+            *self.last_locks.lock() = now;
+        }
+        self.wanted.notify_one();
+        self.picture.lock().view(wanted)
+    }
+}
+
+/// Observes the domain whenever pages show it, until it is stopped.
+pub(super) async fn run(observation: Arc<Observation>, config: Config) {
+    let mut is_stopped = false;
+    while !is_stopped {
+        is_stopped = tokio::select! {
+            () = observation.stopped.notified() => true,
+            () = observation.wanted.notified() => {
+                let observed = observe(&observation, &config).await;
+                match observed {
+                    Ok(is_stopped) => {
+                        *observation.picture.lock() = Picture::default();
+                        is_stopped
+                    }
+                    Err(failure) => {
+                        observation.picture.lock().fail(failure.problem());
+                        let stopped = observation.stopped.notified();
+                        tokio::time::timeout(RETRY, stopped).await.is_ok()
+                    }
+                }
+            }
+        };
+    }
+}
+
+/// Observes the domain until no page has shown it for a while. Returns whether the task has been stopped.
+async fn observe(observation: &Observation, config: &Config) -> Result<bool, Failure> {
+    let library = checker::protocols(&config.monitor.protocols, None)?;
+    let domain = membership::join_briefly(config).await?;
+    let observed = follow(observation, config, &domain, Checker::new(library)).await;
+    domain.close().await;
+    observed
+}
+
+async fn follow(
+    observation: &Observation,
+    config: &Config,
+    domain: &Domain,
+    checker: Checker,
+) -> Result<bool, Failure> {
+    let asker = membership::asker(domain).await?;
+    let locks_asker = register(domain, config).await?;
+    let own = vec![asker.name().to_owned(), locks_asker.name().to_owned()];
+    let watcher = Watcher::open(config, WatchOptions::default()).await;
+    let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
+    let mut observer = Observer::new(WINDOW, checker, own, config, &watcher);
+    let (sender, mut reports) = mpsc::channel(1);
+    let (locks_sender, mut locks) = mpsc::channel(1);
+    let mut ticks = tokio::time::interval(INTERVAL);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let watching = async {
+        loop {
+            tokio::select! {
+                event = watcher.next() => {
+                    let checked = observer.event(&event, &watcher);
+                    observation.picture.lock().handle(&event, checked.as_ref());
+                }
+                Some(report) = reports.recv() => observer.report(report),
+                Some(locks) = locks.recv() => observation.picture.lock().take_locks(locks),
+                _ = ticks.tick() => {
+                    let counted = observer.snapshot(&watcher);
+                    let entries = watcher.directory().entries();
+                    observation.picture.lock().look(SystemTime::now(), &entries, &counted);
+                    if observation.last.lock().elapsed() >= KEPT {
+                        return;
+                    }
+                }
+            }
+        }
+    };
+    let is_stopped = tokio::select! {
+        () = watching => false,
+        () = top::ask(asker, sender) => false,
+        () = ask_for_locks(observation, &locks_asker, locks_sender) => false,
+        () = observation.stopped.notified() => true,
+    };
+    Ok(is_stopped)
+}
+
+async fn register(domain: &Domain, config: &Config) -> Result<Agent, Failure> {
+    let name = format!("fipa-dashboard-{}", Incarnation::random());
+    let options = RegisterOptions {
+        agent_type: fipa::admin::routes::ASKER_TYPE.to_owned(),
+        ..RegisterOptions::default()
+    };
+    membership::register(domain, &name, options, config).await
+}
+
+/// Asks the owners of all locks again and again while a page shows them.
+async fn ask_for_locks(
+    observation: &Observation,
+    agent: &Agent,
+    found: mpsc::Sender<Vec<ResourceStatus>>,
+) {
+    loop {
+        tokio::time::sleep(LOCKS_INTERVAL).await;
+        if observation.last_locks.lock().elapsed() > 2 * LOCKS_INTERVAL {
+            continue;
+        }
+        match agent.query_locks(LOCKS_INTERVAL).await {
+            Ok(locks) => {
+                if found.send(locks).await.is_err() {
+                    return;
+                }
+            }
+            Err(error) => {
+                tracing::debug!(error = %ErrorChain(&error), "the owners of locks cannot be asked")
+            }
+        }
+    }
+}

@@ -1,0 +1,210 @@
+//! The answers at the gateway's listener: the page with its parts, views, and their changes as they happen.
+
+use std::collections::HashMap;
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::{Path, Query, State};
+use axum::http::StatusCode;
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::sse::{Event, Sse};
+use axum::response::{IntoResponse as _, Response};
+use axum::routing::get;
+use axum::{Extension, Router};
+use fipa::web::{KeepOpen, Pages};
+use futures_util::stream;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::{Instant, Interval, MissedTickBehavior};
+
+use super::observation::Observation;
+use super::picture::Wanted;
+use super::view::View;
+
+/// Maximum number of pages that follow the domain at the same time.
+const MAX_STREAMS: usize = 16;
+
+/// Minimum time between two changes that a page gets.
+const PACE: Duration = Duration::from_millis(200);
+
+/// Time without a change after which a page gets a sign of life.
+const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
+
+/// The parts of the page: path, media type, content.
+const PARTS: [(&str, &str, &str); 11] = [
+    (
+        "/",
+        "text/html; charset=utf-8",
+        include_str!("assets/index.html"),
+    ),
+    (
+        "/api/openapi.json",
+        "application/json",
+        include_str!("assets/openapi.json"),
+    ),
+    ("/style.css", CSS, include_str!("assets/style.css")),
+    ("/main.js", JAVASCRIPT, include_str!("assets/main.js")),
+    ("/live.js", JAVASCRIPT, include_str!("assets/live.js")),
+    (
+        "/elements.js",
+        JAVASCRIPT,
+        include_str!("assets/elements.js"),
+    ),
+    ("/fleet.js", JAVASCRIPT, include_str!("assets/fleet.js")),
+    (
+        "/conversations.js",
+        JAVASCRIPT,
+        include_str!("assets/conversations.js"),
+    ),
+    ("/locks.js", JAVASCRIPT, include_str!("assets/locks.js")),
+    ("/letters.js", JAVASCRIPT, include_str!("assets/letters.js")),
+    (
+        "/icon.svg",
+        "image/svg+xml",
+        include_str!("assets/icon.svg"),
+    ),
+];
+const CSS: &str = "text/css; charset=utf-8";
+const JAVASCRIPT: &str = "text/javascript; charset=utf-8";
+
+#[derive(Clone)]
+struct Shown {
+    observation: Arc<Observation>,
+    places: Arc<Semaphore>,
+}
+
+/// Returns the pages that show what is observed.
+pub(super) fn pages(observation: Arc<Observation>) -> Pages {
+    let shown = Shown {
+        observation,
+        places: Arc::new(Semaphore::new(MAX_STREAMS)),
+    };
+    let part =
+        |router: Router,
+         (path, media_type, content): (&'static str, &'static str, &'static str)| {
+            // A browser asks each time, so that it never mixes parts of two versions.
+            let headers = [(CONTENT_TYPE, media_type), (CACHE_CONTROL, "no-cache")];
+            router.route(path, get(move || async move { (headers, content) }))
+        };
+    let mut pages = Pages::default();
+    pages.public = PARTS.into_iter().fold(Router::new(), part);
+    pages.protected = Router::new()
+        .route("/api/live/{view}", get(live))
+        .route("/api/{view}", get(snapshot))
+        .with_state(shown);
+    pages
+}
+
+/// The view that a path and its parameters name.
+fn wanted(view: &str, parameters: &mut HashMap<String, String>) -> Result<Wanted, Response> {
+    let mut parameter = |name: &str| {
+        let missing = || {
+            (
+                StatusCode::BAD_REQUEST,
+                format!("the parameter {name} is missing\n"),
+            )
+                .into_response()
+        };
+        parameters.remove(name).ok_or_else(missing)
+    };
+    match view {
+        "fleet" => Ok(Wanted::Fleet),
+        "agent" => parameter("name").map(Wanted::Agent),
+        "conversations" => Ok(Wanted::Conversations),
+        "conversation" => parameter("id").map(Wanted::Conversation),
+        "locks" => Ok(Wanted::Locks),
+        "letters" => Ok(Wanted::Letters),
+        _ => {
+            let why =
+                "the views are fleet, agent, conversations, conversation, locks and letters\n";
+            Err((StatusCode::NOT_FOUND, why).into_response())
+        }
+    }
+}
+
+/// Answers with a view as it is now.
+async fn snapshot(
+    State(shown): State<Shown>,
+    Path(view): Path<String>,
+    Query(mut parameters): Query<HashMap<String, String>>,
+) -> Response {
+    match wanted(&view, &mut parameters) {
+        Ok(wanted) => {
+            let json = shown.observation.view(&wanted).json();
+            ([(CONTENT_TYPE, "application/json")], json).into_response()
+        }
+        Err(refusal) => refusal,
+    }
+}
+
+/// A page that follows a view.
+struct Following {
+    observation: Arc<Observation>,
+    wanted: Wanted,
+    /// The state that the page has.
+    sent: Option<Arc<View>>,
+    at: Instant,
+    pace: Interval,
+    _place: OwnedSemaphorePermit,
+}
+
+/// Answers with a view, and with its changes as they happen.
+async fn live(
+    State(shown): State<Shown>,
+    Path(view): Path<String>,
+    Query(mut parameters): Query<HashMap<String, String>>,
+    Extension(connection): Extension<KeepOpen>,
+) -> Response {
+    let wanted = match wanted(&view, &mut parameters) {
+        Ok(wanted) => wanted,
+        Err(refusal) => return refusal,
+    };
+    let Ok(place) = Arc::clone(&shown.places).try_acquire_owned() else {
+        let why = format!("{MAX_STREAMS} pages follow this host already; close one\n");
+        return (StatusCode::SERVICE_UNAVAILABLE, why).into_response();
+    };
+    connection.keep();
+    let mut pace = tokio::time::interval(PACE);
+    pace.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let following = Following {
+        observation: shown.observation,
+        wanted,
+        sent: None,
+        at: Instant::now(),
+        pace,
+        _place: place,
+    };
+    let events = stream::unfold(following, |mut following| async {
+        let event = following.next().await;
+        Some((Ok::<_, Infallible>(event), following))
+    });
+    Sse::new(events).into_response()
+}
+
+impl Following {
+    /// Waits for the next change. Called again only when the page has taken the last one: a slow page gets fewer
+    /// changes, each with all that has happened since.
+    async fn next(&mut self) -> Event {
+        loop {
+            self.pace.tick().await;
+            let view = self.observation.view(&self.wanted);
+            let event = match &self.sent {
+                None => Some(Event::default().event("snapshot").data(view.json())),
+                Some(sent) if Arc::ptr_eq(sent, &view) => None,
+                Some(sent) => view
+                    .changes_since(sent)
+                    .map(|changes| Event::default().event("changes").data(changes)),
+            };
+            self.sent = Some(view);
+            let now = Instant::now();
+            if let Some(event) = event {
+                self.at = now;
+                return event;
+            }
+            if now.duration_since(self.at) >= SIGN_OF_LIFE {
+                self.at = now;
+                return Event::default().event("alive").data("{}");
+            }
+        }
+    }
+}

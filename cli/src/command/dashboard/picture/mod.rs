@@ -1,0 +1,206 @@
+//! The state of the domain that the dashboard shows, from observed letters, the directory and reports. No I/O.
+//!
+//! All tables are bounded, and so is each text: any process of the domain can invent names.
+
+mod agents;
+mod conversations;
+mod letters;
+
+use std::sync::Arc;
+use std::time::SystemTime;
+
+use fipa::Entry;
+use fipa::admin::watch::{Event, Passage};
+use fipa::locks::ResourceStatus;
+use serde_json::{Value, json};
+
+use self::agents::Agents;
+use self::conversations::Conversations;
+use self::letters::{Letter, Letters};
+use super::view::View;
+use crate::command::locks;
+use crate::command::top::{Snapshot, peer_object, totals_object};
+use crate::command::watch::checker::CheckResult;
+use crate::output;
+
+/// Maximum length of a text, in characters.
+const MAX_TEXT: usize = 256;
+
+/// Maximum number of letters in a view.
+const SHOWN_LETTERS: usize = 200;
+
+/// Maximum number of conversations in a view.
+const SHOWN_CONVERSATIONS: usize = 200;
+
+/// The state of the domain.
+#[derive(Debug, Default)]
+pub(super) struct Picture {
+    agents: Agents,
+    conversations: Conversations,
+    letters: Letters,
+    locks: Vec<ResourceStatus>,
+    /// The fleet at the last look.
+    fleet: Arc<View>,
+    /// The reason why the domain cannot be observed.
+    problem: Option<String>,
+}
+
+/// A view with its parameter.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Wanted {
+    /// Hosts, agents and coalitions.
+    Fleet,
+    /// An agent, its conversations and its letters.
+    Agent(String),
+    /// The conversations with the newest letters, and those with violations.
+    Conversations,
+    /// A conversation with its letters.
+    Conversation(String),
+    /// The resources that agents lock.
+    Locks,
+    /// The newest letters.
+    Letters,
+}
+
+impl Picture {
+    /// Handles an event of a letter; `checked` is the result of the check of a new one.
+    pub(super) fn handle(&mut self, event: &Event, checked: Option<&CheckResult>) {
+        match (event, checked) {
+            (Event::Letter(passage), Some(checked)) => {
+                let letter = Letter::of(passage, checked);
+                self.conversations.add(passage, checked, &letter);
+                self.letters.add(letter);
+            }
+            (Event::Later(passage) | Event::Confirmed(passage), _) => self.news(passage),
+            _ => {}
+        }
+    }
+
+    fn news(&mut self, passage: &Passage) {
+        self.letters.news(passage);
+        self.conversations.news(passage);
+    }
+
+    /// Takes the agents in the directory, and the counted letters.
+    pub(super) fn look(&mut self, now: SystemTime, entries: &[Arc<Entry>], counted: &Snapshot) {
+        self.problem = None;
+        self.agents.look(now, entries);
+        let mut fleet = View::default();
+        for section in ["agents", "hosts"] {
+            fleet.section(section);
+        }
+        let totals = Value::Object(totals_object(counted));
+        fleet.put("domain", "totals", &totals);
+        for peer in &counted.peers {
+            fleet.put("hosts", clipped(&peer.name), &peer_object(peer));
+        }
+        for (name, row) in self.agents.rows(&counted.agents) {
+            fleet.put("agents", name, &row);
+        }
+        self.fleet = Arc::new(fleet);
+    }
+
+    /// Takes the state of all locks.
+    pub(super) fn take_locks(&mut self, locks: Vec<ResourceStatus>) {
+        self.locks = locks;
+    }
+
+    /// Takes the reason why the domain cannot be observed.
+    pub(super) fn fail(&mut self, problem: String) {
+        self.problem = Some(problem);
+    }
+
+    /// Returns a view.
+    pub(super) fn view(&self, wanted: &Wanted) -> Arc<View> {
+        if let Some(problem) = &self.problem {
+            let mut view = View::default();
+            view.put("domain", "totals", &json!({ "problem": problem }));
+            return Arc::new(view);
+        }
+        match wanted {
+            Wanted::Fleet => return Arc::clone(&self.fleet),
+            Wanted::Agent(name) => self.agent(name),
+            Wanted::Conversations => self.all_conversations(),
+            Wanted::Conversation(id) => self.conversation(id),
+            Wanted::Locks => self.all_locks(),
+            Wanted::Letters => self.newest_letters(|_| true),
+        }
+        .into()
+    }
+
+    fn agent(&self, name: &str) -> View {
+        let mut view = self.newest_letters(|letter| letter.from == name || letter.to == name);
+        for section in ["agent", "conversations"] {
+            view.section(section);
+        }
+        if let Some(row) = self.agents.row(name) {
+            view.put("agent", name, &row);
+        }
+        let takes_part = |row: &Value| {
+            let names = row["participants"].as_array();
+            names.is_some_and(|names| names.iter().any(|it| it == name))
+        };
+        self.put_conversations(&mut view, takes_part);
+        view
+    }
+
+    fn all_conversations(&self) -> View {
+        let mut view = View::default();
+        view.section("conversations");
+        self.put_conversations(&mut view, |_| true);
+        view
+    }
+
+    fn put_conversations(&self, view: &mut View, shown: impl Fn(&Value) -> bool) {
+        let rows = self.conversations.newest().filter(|(_, row)| shown(row));
+        for (id, row) in rows.take(SHOWN_CONVERSATIONS) {
+            view.put("conversations", id, &row);
+        }
+    }
+
+    fn conversation(&self, id: &str) -> View {
+        let mut view = View::default();
+        for section in ["conversation", "letters"] {
+            view.section(section);
+        }
+        if let Some((row, letters)) = self.conversations.steps(id) {
+            view.put("conversation", id, &row);
+            for letter in letters {
+                view.put("letters", letter.number.to_string(), &letter.row());
+            }
+        }
+        view
+    }
+
+    fn all_locks(&self) -> View {
+        let mut view = View::default();
+        view.section("locks");
+        for lock in &self.locks {
+            view.put("locks", lock.resource.as_str(), &locks::in_json(lock));
+        }
+        view
+    }
+
+    fn newest_letters(&self, shown: impl Fn(&Letter) -> bool) -> View {
+        let mut view = View::default();
+        view.section("letters");
+        let letters = self.letters.newest().filter(|letter| shown(letter));
+        for letter in letters.take(SHOWN_LETTERS) {
+            view.put("letters", letter.number.to_string(), &letter.row());
+        }
+        view
+    }
+}
+
+/// The beginning of a text.
+fn clipped(text: &str) -> String {
+    match text.char_indices().nth(MAX_TEXT) {
+        Some((end, _)) => format!("{}…", text.get(..end).unwrap_or_default()),
+        None => text.to_owned(),
+    }
+}
+
+/// A time as RFC 3339; empty if it has no such form.
+fn moment(time: SystemTime) -> String {
+    output::rfc3339(time).unwrap_or_default()
+}
