@@ -86,24 +86,27 @@ pub(super) fn pages(observation: Arc<Observation>) -> Pages {
             let headers = [(CONTENT_TYPE, media_type), (CACHE_CONTROL, "no-cache")];
             router.route(path, get(move || async move { (headers, content) }))
         };
-    let mut pages = Pages::default();
-    pages.public = PARTS.into_iter().fold(Router::new(), part);
-    pages.protected = Router::new()
+    let protected = Router::new()
         .route("/api/live/{view}", get(live))
         .route("/api/{view}", get(snapshot))
         .with_state(shown);
-    pages
+    Pages {
+        public: PARTS.into_iter().fold(Router::new(), part),
+        protected,
+    }
 }
 
+/// The answer to a request for no view.
+type Refusal = (StatusCode, String);
+
 /// The view that a path and its parameters name.
-fn wanted(view: &str, parameters: &mut HashMap<String, String>) -> Result<Wanted, Response> {
+fn wanted(view: &str, parameters: &mut HashMap<String, String>) -> Result<Wanted, Refusal> {
     let mut parameter = |name: &str| {
         let missing = || {
             (
                 StatusCode::BAD_REQUEST,
                 format!("the parameter {name} is missing\n"),
             )
-                .into_response()
         };
         parameters.remove(name).ok_or_else(missing)
     };
@@ -117,7 +120,7 @@ fn wanted(view: &str, parameters: &mut HashMap<String, String>) -> Result<Wanted
         _ => {
             let why =
                 "the views are fleet, agent, conversations, conversation, locks and letters\n";
-            Err((StatusCode::NOT_FOUND, why).into_response())
+            Err((StatusCode::NOT_FOUND, why.to_owned()))
         }
     }
 }
@@ -133,7 +136,7 @@ async fn snapshot(
             let json = shown.observation.view(&wanted).json();
             ([(CONTENT_TYPE, "application/json")], json).into_response()
         }
-        Err(refusal) => refusal,
+        Err(refusal) => refusal.into_response(),
     }
 }
 
@@ -157,7 +160,7 @@ async fn live(
 ) -> Response {
     let wanted = match wanted(&view, &mut parameters) {
         Ok(wanted) => wanted,
-        Err(refusal) => return refusal,
+        Err(refusal) => return refusal.into_response(),
     };
     let Ok(place) = Arc::clone(&shown.places).try_acquire_owned() else {
         let why = format!("{MAX_STREAMS} pages follow this host already; close one\n");
