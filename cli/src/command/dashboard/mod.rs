@@ -20,6 +20,7 @@ use clap::Args;
 use fipa::Config;
 use fipa::web::Pages;
 use fipa_acl::escape;
+use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
 use serde_json::json;
 use tokio::task::JoinHandle;
 
@@ -85,11 +86,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             "run the command as the user of the gateway",
         )
     })?;
-    let link = format!(
-        "http://{}/#token={}",
-        listener.address,
-        in_link(token.trim_end())
-    );
+    // A token of the user's own may have characters that end a link or the attribute of a page.
+    let token = utf8_percent_encode(token.trim_end(), NON_ALPHANUMERIC);
+    let link = format!("http://{}/#token={token}", listener.address);
     if arguments.json {
         let address = listener.address.to_string();
         return output::json(&json!({ "domain": config.domain, "address": address, "link": link }));
@@ -102,17 +101,6 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         open_browser(&config, &link)?;
     }
     Ok(())
-}
-
-/// A token of the user's own may have characters that end a link or the attribute of a page.
-fn in_link(token: &str) -> String {
-    token.bytes().fold(String::new(), |mut text, byte| {
-        match byte.is_ascii_alphanumeric() {
-            true => text.push(char::from(byte)),
-            false => text.push_str(&format!("%{byte:02X}")),
-        }
-        text
-    })
 }
 
 /// Opens the link in a browser. The link goes through a file that only this user can read: all users see the
