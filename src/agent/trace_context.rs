@@ -148,7 +148,7 @@ mod tests {
 
     use super::*;
     #[cfg(feature = "shm")]
-    use crate::{Config, Domain, config::Sources};
+    use crate::{Config, Domain, Kind};
 
     const PARENT: &str = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
 
@@ -325,14 +325,15 @@ mod tests {
     #[cfg(feature = "shm")]
     #[tokio::test]
     async fn a_loan_has_room_for_the_longest_trace_context() {
-        let mut sources = Sources::default();
-        let domain = format!("domain=loans-in-spans-{}", std::process::id());
-        sources.set = vec![domain, "mts.transports=shm".to_owned()];
-        let config = Config::load(&sources).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let mut config = Config::for_host("loans");
+        config.domain = format!("loans-in-spans-{}", std::process::id());
+        config.runtime_dir = directory.path().join("run").to_string_lossy().into_owned();
+        config.mts.transports = vec![Kind::Shm];
         let here = Domain::open(&config).await.unwrap();
         let there = Domain::open(&config).await.unwrap();
         let rover = here.register("rover").await.unwrap();
-        let _arm = there.register("arm").await.unwrap();
+        let arm = there.register("arm").await.unwrap();
         let message = rover.message(Performative::Inform).receiver("arm");
         let loan = rover.loan(message, 1 << 20).unwrap();
         let sent = {
@@ -343,6 +344,7 @@ mod tests {
         assert!(sent.await.unwrap().all_succeeded());
         let counters = here.inner.service.shm_counters();
         assert_eq!((counters.loans_sent, counters.loans_copied), (1, 0));
+        drop((rover, arm));
         here.close().await;
         there.close().await;
     }
