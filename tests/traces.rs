@@ -65,7 +65,7 @@ impl Tracing {
     }
 }
 
-/// What a letter has of a span.
+/// The span that a letter carries.
 fn line(span: &SpanContext) -> String {
     let (trace, id, flags) = (span.trace_id(), span.span_id(), span.trace_flags());
     format!("{trace} {id} {flags:02x} {}", span.trace_state().header())

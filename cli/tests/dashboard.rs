@@ -5,67 +5,30 @@
 #[path = "common/browser.rs"]
 mod browser;
 mod common;
+#[path = "common/listener.rs"]
+mod listener;
 
-use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
-use std::net::{SocketAddr, TcpStream};
+use std::net::TcpStream;
 use std::process::Stdio;
-use std::time::Duration;
 
 use browser::Browser;
-use common::{Host, Running};
+use common::Host;
 use fipa_testbed::{ChildGuard, until};
+use listener::Shown;
 use serde_json::Value;
-
-/// Timeout for hanging tests.
-const WATCHDOG: Duration = Duration::from_secs(60);
 
 /// Maximum number of pages that follow a gateway.
 const MAX_STREAMS: usize = 16;
 
-/// A gateway with a dashboard.
-struct Shown {
-    gateway: Running,
-    address: SocketAddr,
-    token: String,
-}
-
 impl Shown {
-    fn start(host: &Host, listen: &str, options: &[&str]) -> Self {
-        let listen = format!("http.listen={listen}");
-        let mut arguments = vec!["up", "--json", "--set", &listen];
-        arguments.extend(options.iter().flat_map(|option| ["--set", option]));
-        let gateway = host.start(&arguments);
-        let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
-        let file = ready["http"]["token_file"].as_str().unwrap();
-        Self {
-            gateway,
-            address: ready["http"]["address"].as_str().unwrap().parse().unwrap(),
-            token: fs::read_to_string(file).unwrap().trim_end().to_owned(),
-        }
-    }
-
-    fn connect(&self) -> TcpStream {
-        let stream = TcpStream::connect(self.address).unwrap();
-        stream.set_read_timeout(Some(WATCHDOG)).unwrap();
-        stream
-    }
-
-    /// Sends a request with these headers beside `Host`. Returns the status, the headers, and the body.
+    /// Sends a request with these headers beside `Host`. Returns the status, the headers in lower case, and the body.
     fn ask(&self, method: &str, path: &str, headers: &str, body: &str) -> (u16, String, String) {
-        let mut stream = self.connect();
         let (address, length) = (self.address, body.len());
         let head = format!("{method} {path} HTTP/1.1\r\nHost: {address}\r\n{headers}");
-        write!(stream, "{head}Content-Length: {length}\r\n\r\n{body}").unwrap();
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).unwrap();
-        let (head, body) = answer.split_once("\r\n\r\n").unwrap();
-        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
-        (status, head.to_ascii_lowercase(), body.to_owned())
-    }
-
-    fn bearer(&self) -> String {
-        format!("Authorization: Bearer {}\r\n", self.token)
+        let request = format!("{head}Content-Length: {length}\r\n\r\n{body}");
+        let (status, head, body) = self.exchange(&request);
+        (status, head.to_ascii_lowercase(), body)
     }
 
     /// The headers of a change by the page of this listener.

@@ -3,19 +3,21 @@
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
+#[path = "common/listener.rs"]
+mod listener;
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::{Read as _, Write as _};
-use std::net::{SocketAddr, TcpStream};
+use std::net::TcpStream;
 use std::time::Duration;
 
-use common::{Host, Running};
+use common::Host;
 use fipa::blocking::Wait;
 use fipa::config::Sources;
 use fipa::{Agent, Config, Domain, Kind, Message, Performative};
 use fipa_testbed::until;
-use serde_json::Value;
+use listener::Shown;
 
 /// Timeout for hanging tests.
 const WATCHDOG: Duration = Duration::from_secs(60);
@@ -23,56 +25,21 @@ const WATCHDOG: Duration = Duration::from_secs(60);
 /// Maximum number of series of a host without neighbors.
 const MAX_SERIES: usize = 200;
 
-/// A gateway that shows metrics.
-struct Shown {
-    gateway: Running,
-    address: SocketAddr,
-    token: String,
+/// Starts a gateway that shows metrics.
+fn shown(host: &Host, listen: &str, settings: &[&str]) -> Shown {
+    let settings = [&["http.names=[\"rover.example\"]"], settings].concat();
+    Shown::start(host, listen, &settings)
 }
 
 impl Shown {
-    fn start(host: &Host, listen: &str) -> Self {
-        Self::start_with(host, listen, &[])
-    }
-
-    fn start_with(host: &Host, listen: &str, settings: &[&str]) -> Self {
-        let listen = format!("http.listen={listen}");
-        let own = [&*listen, "http.names=[\"rover.example\"]"];
-        let settings = own.iter().chain(settings);
-        let settings = settings.flat_map(|setting| ["--set", setting]);
-        let arguments: Vec<_> = ["up", "--json"].into_iter().chain(settings).collect();
-        let gateway = host.start(&arguments);
-        let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
-        let file = ready["http"]["token_file"].as_str().unwrap();
-        Self {
-            gateway,
-            address: ready["http"]["address"].as_str().unwrap().parse().unwrap(),
-            token: fs::read_to_string(file).unwrap().trim_end().to_owned(),
-        }
-    }
-
     /// The status and the body of the answer to a request with these lines after the first.
     fn ask(&self, path: &str, headers: &str) -> (u16, String) {
-        let mut stream = self.connect();
-        write!(stream, "GET {path} HTTP/1.1\r\n{headers}\r\n").unwrap();
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).unwrap();
-        let (head, body) = answer.split_once("\r\n\r\n").unwrap();
-        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
-        (status, body.to_owned())
-    }
-
-    fn connect(&self) -> TcpStream {
-        let stream = TcpStream::connect(self.address).unwrap();
-        stream.set_read_timeout(Some(WATCHDOG)).unwrap();
-        stream
+        let (status, _, body) = self.exchange(&format!("GET {path} HTTP/1.1\r\n{headers}\r\n"));
+        (status, body)
     }
 
     fn admitted(&self) -> String {
-        format!(
-            "Host: {}\r\nAuthorization: Bearer {}\r\n",
-            self.address, self.token
-        )
+        format!("Host: {}\r\n{}", self.address, self.bearer())
     }
 
     /// Waits until a series has this value.
@@ -104,7 +71,7 @@ fn letters(direction: &str, transport: &str, outcome: &str) -> String {
 #[test]
 fn letters_of_all_processes_are_counted_and_stay_counted_when_these_end() {
     let host = Host::new();
-    let shown = Shown::start(&host, "127.0.0.1:0");
+    let shown = shown(&host, "127.0.0.1:0", &[]);
     let echo = host.echo("echo");
     let before = shown.values();
     assert_eq!(before.get(&letters("sent", "shm", "delivered")), None);
@@ -147,7 +114,7 @@ fn letters_of_all_processes_are_counted_and_stay_counted_when_these_end() {
 #[test]
 fn counters_survive_the_removal_of_their_files() {
     let host = Host::new();
-    let shown = Shown::start(&host, "127.0.0.1:0");
+    let shown = shown(&host, "127.0.0.1:0", &[]);
     let mut echo = host.start(&["-v", "echo", "echo"]);
     let ping = ["ping", "echo", "--count", "10", "--interval", "1ms"];
     host.run(&ping).done();
@@ -170,7 +137,7 @@ fn counters_survive_the_removal_of_their_files() {
 #[test]
 fn violations_are_counted_by_protocol() {
     let host = Host::new();
-    let shown = Shown::start(&host, "[::1]:0");
+    let shown = shown(&host, "[::1]:0", &[]);
     let mut echo = host.start(&["echo", "echo", "--set", "monitor.check=warn"]);
     let text = [
         "send",
@@ -231,7 +198,7 @@ fn letters_wait(from: &Agent, to: &Agent, over: Kind, shown: &Shown) {
 #[test]
 fn letters_that_an_agent_does_not_read_are_queued_until_it_reads_or_ends() {
     let host = Host::new();
-    let shown = Shown::start(&host, "127.0.0.1:0");
+    let shown = shown(&host, "127.0.0.1:0", &[]);
     let (one, other) = (join(&host), join(&host));
     let rover = one.register("rover").wait().unwrap();
     let arm = other.register("arm").wait().unwrap();
@@ -247,11 +214,11 @@ fn letters_wait_at_another_host(address: &str) {
     let (near, far) = (Host::new(), Host::new());
     let listen = format!("transport.tcp.listen=[\"{address}:0\"]");
     let named = |name: &str| format!("mts.name={name}-{}", near.domain);
-    let far_shown = Shown::start_with(&far, "127.0.0.1:0", &[&listen, &named("far")]);
+    let far_shown = shown(&far, "127.0.0.1:0", &[&listen, &named("far")]);
     let at = far_shown.gateway.tcp_address();
     let knows = format!("discovery.static={{ far = [\"tcp://{at}\"] }}");
     let settings = [&*listen, &knows, &named("near")];
-    let near_shown = Shown::start_with(&near, "127.0.0.1:0", &settings);
+    let near_shown = shown(&near, "127.0.0.1:0", &settings);
     let (here, there) = (join(&near), join(&far));
     let rover = here.register("rover").wait().unwrap();
     let arm = there.register("arm").wait().unwrap();
@@ -305,7 +272,7 @@ fn waits(pid: &str) -> u64 {
 fn a_question_for_metrics_wakes_no_other_process() {
     const QUESTIONS: u64 = 200;
     let host = Host::new();
-    let shown = Shown::start(&host, "127.0.0.1:0");
+    let shown = shown(&host, "127.0.0.1:0", &[]);
     let echo = host.echo("echo");
     host.run(&["ping", "echo", "--count", "1"]).done();
     let before = waits(&echo.pid());
@@ -323,7 +290,7 @@ fn a_question_for_metrics_wakes_no_other_process() {
 #[test]
 fn requests_without_the_token_or_under_another_name_are_refused() {
     let host = Host::new();
-    let shown = Shown::start(&host, "127.0.0.1:0");
+    let shown = shown(&host, "127.0.0.1:0", &[]);
     let own = format!("Host: {}\r\n", shown.address);
     let token = format!("Authorization: Bearer {}\r\n", shown.token);
     for path in ["/metrics", "/healthz", "/readyz"] {

@@ -11,7 +11,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use common::{Host, Ran, Running};
+use common::{Far, Host, Ran, Running};
 use fastrand::Rng;
 use fipa_testbed::languages::mcap_python;
 use mcap_file::{Compression, rechunked};
@@ -806,18 +806,14 @@ fn an_abandoned_lock_is_in_the_log() {
 fn a_host_that_is_gone_is_one_event() {
     let (host, other) = (Host::new(), Host::new());
     let file = host.path("run.mcap");
-    let far = format!("far-{}", other.domain);
-    let _far = other.echo(&far);
-    let crex = other.start(&["up", "--json", "--set", "mts.name=crex"]);
-    let peer = format!(
-        "discovery.static={{ crex = [\"tcp://{}\"] }}",
-        crex.tcp_address()
-    );
-    let _gateway = host.start(&["up", "--set", "mts.name=sherpa", "--set", &peer]);
-    fipa_testbed::until("the far agent is announced", || {
-        let known = host.run(&["agents", &far, "--json"]).done_json();
-        !known["agents"][0].is_null()
-    });
+    let (
+        _gateway,
+        Far {
+            crex,
+            echo: _far,
+            name: far,
+        },
+    ) = Far::connected(&host, &other);
     let recording = record(&host, &["-o", text(&file)]);
     let ask = [
         "send",

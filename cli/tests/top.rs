@@ -10,7 +10,7 @@ use std::io::Write as _;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{Host, Running};
+use common::{Far, Host, Running};
 use fipa_testbed::{ChildGuard, until};
 use serde_json::Value;
 
@@ -173,18 +173,14 @@ fn tables_are_printed_without_a_terminal() {
 #[test]
 fn hosts_are_connected_with_their_letters_and_then_lost() {
     let (host, other) = (Host::new(), Host::new());
-    let far = format!("far-{}", other.domain);
-    let _far = other.echo(&far);
-    let crex = other.start(&["up", "--json", "--set", "mts.name=crex"]);
-    let peer = format!(
-        "discovery.static={{ crex = [\"tcp://{}\"] }}",
-        crex.tcp_address()
-    );
-    let _gateway = host.start(&["up", "--set", "mts.name=sherpa", "--set", &peer]);
-    let known = || host.run(&["agents", &far, "--json"]).done_json();
-    until("the far agent is announced", || {
-        !known()["agents"][0].is_null()
-    });
+    let (
+        _gateway,
+        Far {
+            crex,
+            echo: _far,
+            name: far,
+        },
+    ) = Far::connected(&host, &other);
     let mut top = host.start(&["top", "--json", "--every", "500ms"]);
     // The echo agent answers each request.
     let ask = [

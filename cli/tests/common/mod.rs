@@ -211,6 +211,33 @@ impl Ran {
     }
 }
 
+/// An echo agent on another host, and the gateway of that host.
+pub(crate) struct Far {
+    /// The gateway, named `crex`.
+    pub(crate) crex: Running,
+    pub(crate) echo: Running,
+    /// The name of the agent.
+    pub(crate) name: String,
+}
+
+impl Far {
+    /// Starts the gateways of two hosts, and the agent on the other one. Waits until the gateway of this host, which is
+    /// also returned, knows the agent.
+    pub(crate) fn connected(host: &Host, other: &Host) -> (Running, Self) {
+        let name = format!("far-{}", other.domain);
+        let echo = other.echo(&name);
+        let crex = other.start(&["up", "--json", "--set", "mts.name=crex"]);
+        let address = crex.tcp_address();
+        let peer = format!("discovery.static={{ crex = [\"tcp://{address}\"] }}");
+        let gateway = host.start(&["up", "--set", "mts.name=sherpa", "--set", &peer]);
+        fipa_testbed::until("the far agent is announced", || {
+            let known = host.run(&["agents", &name, "--json"]).done_json();
+            !known["agents"][0].is_null()
+        });
+        (gateway, Self { crex, echo, name })
+    }
+}
+
 /// A running command. It is killed when the value is dropped.
 pub(crate) struct Running {
     child: ChildGuard,

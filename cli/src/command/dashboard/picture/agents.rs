@@ -65,16 +65,16 @@ impl Agents {
         &'a self,
         counted: &[AgentRow],
     ) -> impl Iterator<Item = (&'a str, Value)> {
-        let counted: BTreeMap<String, Value> = counted
+        let mut counted: BTreeMap<String, Value> = counted
             .iter()
             .map(|row| (row.name.clone(), agent_object(row)))
             .collect();
         self.known.iter().map(move |(name, agent)| {
             let mut row = agent.row(name);
             if let (Some(row), Some(Value::Object(counted))) =
-                (row.as_object_mut(), counted.get(name))
+                (row.as_object_mut(), counted.remove(name))
             {
-                row.extend(counted.clone());
+                row.extend(counted);
             }
             (name.as_str(), row)
         })

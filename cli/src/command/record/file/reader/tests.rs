@@ -228,7 +228,7 @@ fn chunks_that_announce_or_unpack_to_gigabytes_take_bounded_memory() {
     let file = file();
     let limit = MAX_RECORD as u64;
     let read = |record: &[u8]| read_within(MEMORY, &[&file[..8], record].concat());
-    // What the format calls an exponent of 13 is a window of 8 MiB; 31 is one of 2 TiB.
+    // The exponent 13 of the format is a window of 8 MiB, and 31 is one of 2 TiB.
     let (usual, largest) = (13 << 3, 31 << 3);
     for (announced, len, window, expected) in [
         (4 << 30, 10, usual, "4294967296"),
