@@ -140,6 +140,7 @@ peer_bytes = \"256MiB\"                # default
 listen = \"\"                          # default
 names = []                           # default
 token_file = \"\"                      # default
+control = false                      # default
 
 [contacts]
 networks = []                        # default

@@ -8,9 +8,12 @@ mod common;
 #[path = "common/listener.rs"]
 mod listener;
 
+use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
 use std::process::Stdio;
+use std::sync::Arc;
+use std::time::Duration;
 
 use browser::Browser;
 use common::Host;
@@ -264,8 +267,21 @@ fn the_description_of_the_interface_is_what_the_gateway_answers() {
         assert_eq!(status, 200, "{path}");
         serde_json::from_str::<Value>(&body).unwrap()
     };
+    let (status, head, svg) = shown.ask(
+        "GET",
+        "/api/protocol.svg?name=fipa-request&state=agreed",
+        &shown.bearer(),
+        "",
+    );
+    assert_eq!(status, 200, "{svg}");
+    assert!(
+        head.contains("image/svg+xml") && svg.contains("agreed"),
+        "{svg}"
+    );
     for (path, description_of_path) in description["paths"].as_object().unwrap() {
-        let get = &description_of_path["get"];
+        let Some(get) = description_of_path.get("get") else {
+            continue;
+        };
         let given = match get["parameters"][0]["name"].as_str() {
             Some("name") => "?name=crane",
             Some("id") => "?id=c1",
@@ -277,8 +293,10 @@ fn the_description_of_the_interface_is_what_the_gateway_answers() {
         until(path, || {
             view = answer(&format!("{path}{given}"));
             let sections = schema["properties"].as_object().unwrap();
+            // There is no other host, and all letters are delivered.
+            let may_be_empty = |section: &str| matches!(section, "hosts" | "reasons");
             let has_rows = |section: &str| {
-                section == "hosts" || view[section].as_object().is_some_and(|it| !it.is_empty())
+                may_be_empty(section) || view[section].as_object().is_some_and(|it| !it.is_empty())
             };
             sections.keys().all(|section| has_rows(section))
         });
@@ -396,6 +414,9 @@ fn the_page_shows_the_agents_that_run_and_those_that_have_ended() {
     }
     // Text stays text.
     assert_eq!(browser.value("document.querySelectorAll('img').length"), 0);
+    until("a chart", || {
+        browser.value("document.querySelectorAll('figure canvas').length") == 1
+    });
     assert_ne!(browser.value("document.title"), "hacked");
 
     let _ = crane.signal("-KILL");
@@ -469,6 +490,10 @@ fn a_violated_conversation_is_first_and_drawn_with_its_violation() {
         drawn.contains("rover") && drawn.contains("arm") && drawn.contains("agree"),
         "{drawn}"
     );
+    // The state machine of the protocol, which the browser has loaded.
+    until("the state machine", || {
+        browser.value("document.querySelector('.machine img').naturalWidth > 100") == true
+    });
     // The page fits a telephone: what is wider scrolls in its own box.
     assert_eq!(browser.value("document.documentElement.scrollWidth"), 390);
     assert_no_messages(&browser);
@@ -516,6 +541,43 @@ fn locks_have_their_holders_and_lost_hosts_stay_in_sight() {
 }
 
 #[test]
+fn other_hosts_reach_the_page_with_the_key_of_the_gateway_only() {
+    let host = Host::new();
+    let keys = host.path("keys");
+    let keys = keys.to_str().unwrap();
+    host.run(&["keys", "init", "--dir", keys]).done();
+    let keys = format!("security.keys={keys}");
+    for listen in ["0.0.0.0:0", "[::]:0"] {
+        let shown = Shown::start(&host, listen, &[&keys]);
+        // Without TLS, there is no answer.
+        let mut stream = shown.connect();
+        let _ = write!(stream, "GET / HTTP/1.1\r\nHost: localhost\r\n\r\n");
+        let mut answer = Vec::new();
+        let _ = stream.read_to_end(&mut answer);
+        assert!(!answer.starts_with(b"HTTP"), "{answer:?}");
+
+        let link = host
+            .run(&["dashboard", "--set", &keys, "--json"])
+            .done_json();
+        let link = link["link"].as_str().unwrap();
+        assert!(link.starts_with("https://"), "{link}");
+        let name = "other_hosts_reach_the_page_with_the_key_of_the_gateway_only";
+        let Some(browser) = Browser::open(name, 1280, 800) else {
+            return;
+        };
+        browser.go_to(link);
+        browser.wait_for("this host");
+        let cookie = browser.cookie();
+        assert_eq!(
+            (&cookie["secure"], &cookie["httpOnly"], &cookie["sameSite"]),
+            (&true.into(), &true.into(), &"Strict".into())
+        );
+        assert_no_messages(&browser);
+        let _ = shown.gateway.signal("-INT");
+    }
+}
+
+#[test]
 fn a_page_asks_for_the_token_when_its_session_has_ended() {
     let host = Host::new();
     let shown = Shown::start(&host, "127.0.0.1:0", &[]);
@@ -538,4 +600,169 @@ fn a_page_asks_for_the_token_when_its_session_has_ended() {
     browser.wait_for("this is not the token");
     enter(&shown.token);
     browser.wait_for("this host");
+}
+
+#[test]
+fn clients_send_messages_only_with_control_and_as_an_agent_of_the_host() {
+    let (host, quiet) = (Host::new(), Host::new());
+    let seeing = Shown::start(&quiet, "127.0.0.1:0", &[]);
+    let headers = seeing.bearer() + &seeing.of_page();
+    let order = r#"{"to": "crane", "performative": "inform", "content": "hello"}"#;
+    assert_eq!(seeing.ask("POST", "/api/send", &headers, order).0, 403);
+
+    let shown = Shown::start(
+        &host,
+        "127.0.0.1:0",
+        &["http.control=true", "mts.name=rover"],
+    );
+    let mut crane = host.start(&["listen", "crane", "--json"]);
+    let mut fleet = shown.follow("fleet");
+    let _ = fleet.event("snapshot");
+    fleet.change("agents", "dashboard@rover", |row| row["here"] == true);
+    let headers = shown.bearer() + &shown.of_page();
+    // Without the proof of the page, or of the client.
+    assert_eq!(
+        shown.ask("POST", "/api/send", &shown.bearer(), order).0,
+        403
+    );
+    assert_eq!(
+        shown.ask("POST", "/api/send", &shown.of_page(), order).0,
+        401
+    );
+    for wrong in [
+        "",
+        "{}",
+        r#"{"to": "crane", "performative": "dance now"}"#,
+        r#"{"to": "crane", "performative": "inform", "sender": "other"}"#,
+    ] {
+        assert_eq!(
+            shown.ask("POST", "/api/send", &headers, wrong).0,
+            400,
+            "{wrong}"
+        );
+    }
+    let (status, _, body) = shown.ask("POST", "/api/send", &headers, order);
+    assert_eq!(status, 200, "{body}");
+    assert!(body.contains("delivered"), "{body}");
+    let received: Value = serde_json::from_str(&crane.line()).unwrap();
+    assert_eq!(
+        received["message"]["sender"]["name"], "dashboard@rover",
+        "{received:#}"
+    );
+    assert_eq!(received["message"]["content"], "hello");
+
+    let name = "clients_send_messages_only_with_control_and_as_an_agent_of_the_host";
+    let Some(browser) = shown.open(name, 390, 844) else {
+        return;
+    };
+    browser.value("location.hash = '#/agent/crane'");
+    until("the form", || {
+        browser.value("document.querySelector('main details')?.hidden") == false
+    });
+    browser.value(
+        "(() => { document.querySelector('details').open = true; \
+                   document.querySelector('textarea').value = 'from the page'; \
+                   document.querySelector('form').requestSubmit(); })()",
+    );
+    browser.wait_for("crane: delivered");
+    let received: Value = serde_json::from_str(&crane.line()).unwrap();
+    assert_eq!(received["message"]["content"], "from the page");
+    assert_no_messages(&browser);
+}
+
+/// Time of the soak, in minutes.
+const SOAK: u64 = 10;
+
+/// Number of agents of the soak.
+const AGENTS: usize = 1000;
+
+/// Letters in 10 ms of the soak.
+const LETTERS: usize = 20;
+
+/// The processor time of a process, in seconds.
+fn processor_time(pid: &str) -> f64 {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
+    let (_, fields) = stat.rsplit_once(')').unwrap();
+    let fields: Vec<&str> = fields.split_whitespace().collect();
+    let ticks: u64 = fields[11].parse::<u64>().unwrap() + fields[12].parse::<u64>().unwrap();
+    ticks as f64 / rustix::param::clock_ticks_per_second() as f64
+}
+
+/// The memory of the page's scripts in bytes, after what is not used any more is gone.
+fn heap(browser: &Browser) -> f64 {
+    browser.chromium("HeapProfiler.collectGarbage");
+    browser
+        .value("performance.memory.usedJSHeapSize")
+        .as_f64()
+        .unwrap()
+}
+
+#[test]
+#[ignore = "takes eleven minutes; see CONTRIBUTING"]
+fn soak() {
+    let host = Host::new();
+    let shown = Shown::start(&host, "127.0.0.1:0", &[]);
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let mut config = fipa::Config::for_host("soak");
+    config.domain.clone_from(&host.domain);
+    config.runtime_dir = host.path("run").to_str().unwrap().to_owned();
+    config.discovery.mdns = false;
+    let domain = runtime.block_on(fipa::Domain::open(&config)).unwrap();
+    let mut agents = Vec::new();
+    for number in 0..AGENTS {
+        agents.push(
+            runtime
+                .block_on(domain.register(&format!("agent_{number:04}")))
+                .unwrap(),
+        );
+    }
+    let agents: Arc<[fipa::Agent]> = agents.into();
+    for number in 0..AGENTS {
+        let agents = Arc::clone(&agents);
+        runtime.spawn(async move { while agents[number].receive().await.is_ok() {} });
+    }
+    let sending = Arc::clone(&agents);
+    runtime.spawn(async move {
+        let mut random = fastrand::Rng::with_seed(44);
+        let mut ticks = tokio::time::interval(Duration::from_millis(10));
+        loop {
+            ticks.tick().await;
+            for _ in 0..LETTERS {
+                let to =
+                    fipa::AgentId::new(format!("agent_{:04}", random.usize(..AGENTS))).unwrap();
+                let from = &sending[random.usize(..AGENTS)];
+                let message = from
+                    .message(fipa::Performative::Inform)
+                    .receiver(to)
+                    .conversation_id(format!("c{}", random.usize(..500)))
+                    .content("1.0 2.0 3.0");
+                // Sends at once; the outcome is of no interest.
+                drop(from.send(message));
+            }
+        }
+    });
+    let browser = shown.open("soak", 1280, 800).unwrap();
+    browser.wait_for("agent_0999");
+    browser.value(
+        "(() => { window.long = []; new PerformanceObserver((list) => \
+         list.getEntries().forEach((entry) => window.long.push(entry.duration))).observe({ type: 'longtask' }); })()",
+    );
+    let pid = shown.gateway.pid();
+    let (started, before) = (std::time::Instant::now(), processor_time(&pid));
+    let mut first = None;
+    for minute in 1..=SOAK {
+        std::thread::sleep(Duration::from_secs(60));
+        let heap = heap(&browser);
+        let first = *first.get_or_insert(heap);
+        let long = browser.value("Math.max(0, ...window.long)");
+        let load = (processor_time(&pid) - before) / started.elapsed().as_secs_f64();
+        println!(
+            "minute {minute}: {:.0} % of a core, heap {:.1} MB ({:.2} of the first), longest task {long} ms, {}",
+            100.0 * load,
+            heap / 1e6,
+            heap / first,
+            browser.value("document.querySelector('.totals').innerText.replaceAll('\\n', ' ')"),
+        );
+    }
+    assert_no_messages(&browser);
 }

@@ -24,6 +24,7 @@ const LEFT: f64 = 2.0 * MARGIN;
 const INK: Color = Color(0x33, 0x33, 0x33);
 const GRAY: Color = Color(0x55, 0x55, 0x55);
 const FINAL: Color = Color(0xee, 0xf4, 0xea);
+const CURRENT: Color = Color(0xff, 0xe0, 0x8a);
 
 /// Colors of the roles. The last one is for all further ones.
 const ROLES: [Color; 5] = [
@@ -54,6 +55,8 @@ pub struct Automaton {
     pub states: Vec<State>,
     /// Index of the first state.
     pub initial: usize,
+    /// Index of the state that is marked as the current one.
+    pub current: Option<usize>,
     /// Further lines of the legend.
     pub legend: Vec<String>,
 }
@@ -139,7 +142,12 @@ impl Automaton {
             line.draw(&placed, LEFT + boxes, &mut out);
         }
         for (at, one) in placed.iter().enumerate() {
-            one.draw(boxes, at == self.initial, &mut out);
+            one.draw(
+                boxes,
+                at == self.initial,
+                self.current == Some(at),
+                &mut out,
+            );
             for (number, row) in one.rows.iter().enumerate() {
                 let y = middle(one, number);
                 draw_row(row, y, boxes, &lines, &mut out);
@@ -206,13 +214,14 @@ impl Placed<'_> {
         self.top + HEAD / 2.0
     }
 
-    fn draw(&self, boxes: f64, is_initial: bool, out: &mut Canvas) {
+    fn draw(&self, boxes: f64, is_initial: bool, is_current: bool, out: &mut Canvas) {
         let (top, height, y) = (self.top, self.height(), self.entry());
-        let fill = match self.state.is_final {
-            true => FINAL,
-            false => Color(0xf4, 0xf6, 0xfa),
+        let fill = match (is_current, self.state.is_final) {
+            (true, _) => CURRENT,
+            (false, true) => FINAL,
+            (false, false) => Color(0xf4, 0xf6, 0xfa),
         };
-        let edge = Paint::edge(INK, 1.0);
+        let edge = Paint::edge(INK, if is_current { 3.0 } else { 1.0 });
         out.rect((LEFT, top), (boxes, height), 8.0, edge.with(fill));
         if self.state.is_final {
             let inner = (boxes - 6.0, height - 6.0);

@@ -151,12 +151,14 @@ fn automaton() -> impl Strategy<Value = Automaton> {
     });
     let texts = || prop::collection::vec(text(), 0..6);
     let states = prop::collection::vec(state, 0..8);
-    (text(), texts(), states, any::<usize>(), texts()).prop_map(
-        |(title, roles, states, initial, legend)| Automaton {
+    let current = any::<Option<usize>>();
+    (text(), texts(), states, any::<usize>(), current, texts()).prop_map(
+        |(title, roles, states, initial, current, legend)| Automaton {
             title,
             roles,
             states,
             initial,
+            current,
             legend,
         },
     )

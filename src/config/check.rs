@@ -137,7 +137,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
     found.security(config);
-    found.http(&config.http);
+    found.http(&config.http, !config.security.keys.is_empty());
     if config.contacts.networks.len() > MAX_NETWORKS {
         let path = ["contacts", "networks"];
         found.too_many(&path, config.contacts.networks.len(), MAX_NETWORKS);
@@ -192,15 +192,21 @@ impl Findings {
         }
     }
 
-    fn http(&mut self, http: &Http) {
-        if !http.listen.is_empty() && !is_on_loopback(&http.listen) {
+    fn http(&mut self, http: &Http, has_keys: bool) {
+        if !http.listen.is_empty() && http.listen.parse::<SocketAddr>().is_err() {
+            self.add(
+                &["http", "listen"],
+                format_args!("is {:?}, which is no address with a port", http.listen),
+                "write for example 127.0.0.1:9790, or 0.0.0.0:9790 for other hosts",
+            );
+        } else if !http.listen.is_empty() && !has_keys && !is_on_loopback(&http.listen) {
             self.add(
                 &["http", "listen"],
                 format_args!(
-                    "is {:?}, which is no address of this host alone",
+                    "is {:?}, which other hosts reach, but there is no key to encrypt with",
                     http.listen
                 ),
-                "use 127.0.0.1 or [::1] and a port, for example 127.0.0.1:9790; a proxy or an SSH tunnel serves others",
+                "set security.keys, or use 127.0.0.1 or [::1], for example 127.0.0.1:9790",
             );
         }
         if http.token_file.starts_with('~') {

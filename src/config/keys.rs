@@ -339,6 +339,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::Text(config.http.token_file.clone()),
     },
     Key {
+        path: &["http", "control"],
+        shape: Shape::Plain,
+        expected: "true or false",
+        write: |config, value| truth(value).map(|open| config.http.control = open),
+        read: |config| Value::Truth(config.http.control),
+    },
+    Key {
         path: &["contacts", "networks"],
         shape: Shape::List,
         expected: r#"a list of networks such as ["10.0.0.0/8"]"#,

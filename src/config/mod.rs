@@ -53,6 +53,7 @@
 //! listen = ""                         # of the gateway, for Prometheus: "127.0.0.1:9790"; empty: off
 //! names = []                          # further names under which clients reach that address
 //! token_file = ""                     # file with the token of clients; empty: in the directory of the domain
+//! control = false                     # true: clients with the token send messages as dashboard@<mts.name>
 //! [contacts]
 //! networks = []                       # networks whose addresses in received identifiers are dialed
 //! [access]
@@ -318,7 +319,8 @@ pub struct Security {
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 #[non_exhaustive]
 pub struct Http {
-    /// `listen`: the address, on loopback, for example `127.0.0.1:9790`. Empty: the gateway does not listen.
+    /// `listen`: the address, for example `127.0.0.1:9790`. Beyond loopback, the gateway encrypts with its key
+    /// (`security.keys`). Empty: the gateway does not listen.
     pub listen: String,
     /// `names`: host names, beside addresses and `localhost`, under which clients reach the address, for example behind
     /// a proxy. At most 16.
@@ -326,6 +328,8 @@ pub struct Http {
     /// `token_file`: the file with the token that clients send. The gateway creates it if it is missing. Empty: the file
     /// `http.token` in the directory of the domain, which ends with the domain.
     pub token_file: String,
+    /// `control`: whether clients send messages, too, as the agent `dashboard@<mts.name>`. Otherwise they only see.
+    pub control: bool,
 }
 
 /// `[contacts]`: the addresses in agent identifiers that the gateway dials for an agent that no directory lists.

@@ -66,6 +66,8 @@ pub struct RouteReport {
 pub struct HttpListener {
     /// The address of `http.listen`, with the port that the system has chosen if the configuration leaves it open.
     pub address: SocketAddr,
+    /// The URL at which this host and, beyond loopback, other hosts reach it.
+    pub url: String,
     /// The file with the token that clients send.
     pub token_file: String,
 }

@@ -26,6 +26,8 @@ mod state;
 use std::collections::BTreeMap;
 use std::fmt;
 #[cfg(feature = "web")]
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+#[cfg(feature = "web")]
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -65,6 +67,8 @@ pub use self::self_check::{SelfCheck, SelfCheckError};
 pub(crate) use self::state::play as play_state;
 use self::state::{Predecessor, StateFile, Trust};
 use crate::admin::reload::ReloadRequests;
+#[cfg(feature = "web")]
+use crate::config::is_on_loopback;
 use crate::config::{ConfigError, Reloaded};
 use crate::domain::background;
 use crate::domain::directory_view::DirectoryView;
@@ -77,7 +81,7 @@ use crate::error::OpenError;
 #[cfg(feature = "web")]
 use crate::error::WebError;
 #[cfg(feature = "web")]
-use crate::web::Pages;
+use crate::web::{Encryption, Pages};
 use crate::{AgentId, Config};
 
 /// A running gateway. Ends when [`close`](Self::close) is called or the value is dropped.
@@ -96,6 +100,9 @@ pub struct Gateway {
     arrivals: Arrivals,
     /// The HTTP listener, as soon as it is open.
     http: Arc<OnceLock<HttpListener>>,
+    /// Encrypts at a listener that other hosts reach.
+    #[cfg(feature = "web")]
+    encryption: Option<Encryption>,
     tasks: Vec<JoinHandle<()>>,
 }
 
@@ -214,6 +221,10 @@ impl Gateway {
             state,
             arrivals: Arrivals::default(),
             http: Arc::default(),
+            #[cfg(all(feature = "web", feature = "secure"))]
+            encryption: guard.as_ref().map(|guard| Encryption(guard.security())),
+            #[cfg(all(feature = "web", not(feature = "secure")))]
+            encryption: None,
             tasks: Vec::new(),
         };
         // The queue is created first, because letters arrive as soon as the name is registered.
@@ -335,10 +346,21 @@ impl Gateway {
             false => PathBuf::from(&http.token_file),
         };
         let token = Token::load(&token_file).map_err(WebError::Token)?;
-        let listener = Listener::open(&http.listen, &http.names, token)?;
+        let encryption = match is_on_loopback(&http.listen) {
+            true => None,
+            false => self.encryption.clone(),
+        };
+        let scheme = if encryption.is_some() {
+            "https"
+        } else {
+            "http"
+        };
+        let listener = Listener::open(&http.listen, &http.names, token, encryption)?;
+        let address = listener.address();
         // Set only here.
         let _ = self.http.set(HttpListener {
-            address: listener.address(),
+            address,
+            url: format!("{scheme}://{}", self.reached_at(address)),
             token_file: token_file.to_string_lossy().into_owned(),
         });
         let shown = metrics::Shown {
@@ -352,6 +374,23 @@ impl Gateway {
         let serving = listener.serve(Arc::new(shown), pages);
         self.tasks.push(tokio::spawn(serving));
         Ok(())
+    }
+
+    /// The address at which other hosts reach a listener of this host.
+    #[cfg(feature = "web")]
+    fn reached_at(&self, address: SocketAddr) -> SocketAddr {
+        if !address.ip().is_unspecified() {
+            return address;
+        }
+        let locations = self.service.shown_locations().into_iter();
+        let mut addresses = locations.filter_map(|it| it.address().parse::<SocketAddr>().ok());
+        let own = addresses
+            .find(|it| it.is_ipv4() == address.is_ipv4() && !is_on_loopback(&it.to_string()));
+        match (own, address.is_ipv4()) {
+            (Some(own), _) => SocketAddr::new(own.ip(), address.port()),
+            (None, true) => SocketAddr::new(Ipv4Addr::LOCALHOST.into(), address.port()),
+            (None, false) => SocketAddr::new(Ipv6Addr::LOCALHOST.into(), address.port()),
+        }
     }
 
     fn means(&self) -> Result<Means, OpenError> {

@@ -10,15 +10,18 @@
 //!
 //! Each request for values needs the token or a session: any user of the host can connect to a loopback address, and so
 //! can any web page that a browser on the host shows. `Host` must be an address, `localhost` or a name of the
-//! configuration, so that no page reaches the listener under a name of its own (DNS rebinding).
+//! configuration, so that no page reaches the listener under a name of its own (DNS rebinding). Beyond loopback, the
+//! listener encrypts with the key of the gateway.
 //!
 //! The gateway has the values; this room knows only `Source`.
 
+mod encryption;
 pub(crate) mod error;
 mod pages;
 mod prometheus;
 mod requests;
 mod sessions;
+mod shares;
 pub(crate) mod token;
 
 use std::future::Future;
@@ -32,13 +35,17 @@ use fipa_transport::log_limit;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use rustix::net::sockopt::set_tcp_user_timeout;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
+pub(crate) use self::encryption::Encryption;
 use self::error::WebError;
 pub use self::pages::{KeepOpen, Pages};
 pub(crate) use self::prometheus::Families;
+use self::requests::Scheme;
+use self::shares::Shares;
 pub(crate) use self::token::Token;
 
 /// Maximum number of connections at the same time. Others wait.
@@ -81,11 +88,17 @@ pub(crate) struct Listener {
     address: SocketAddr,
     token: Token,
     names: Vec<String>,
+    encryption: Option<Encryption>,
 }
 
 impl Listener {
     /// Opens the listener. Must be called within a tokio runtime.
-    pub(crate) fn open(address: &str, names: &[String], token: Token) -> Result<Self, WebError> {
+    pub(crate) fn open(
+        address: &str,
+        names: &[String],
+        token: Token,
+        encryption: Option<Encryption>,
+    ) -> Result<Self, WebError> {
         let failed = |source| WebError::Listen {
             address: address.to_owned(),
             source,
@@ -98,6 +111,7 @@ impl Listener {
             socket,
             token,
             names: names.to_vec(),
+            encryption,
         })
     }
 
@@ -108,44 +122,76 @@ impl Listener {
 
     /// Answers requests until it is aborted.
     pub(crate) async fn serve(self, source: Arc<dyn Source>, pages: Pages) {
-        let routes = requests::routes(source, self.token, self.names, pages);
+        let scheme = match self.encryption {
+            Some(_) => Scheme::Https,
+            None => Scheme::Http,
+        };
+        let routes = requests::routes(source, self.token, self.names, scheme, pages);
         let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
         // Dropped with this future: the connections end with the gateway.
         let mut connections = JoinSet::new();
+        let shares = Arc::new(Shares::default());
         loop {
             while connections.try_join_next().is_some() {}
             let Ok(place) = Arc::clone(&places).acquire_owned().await else {
                 return;
             };
-            let stream = match self.socket.accept().await {
-                Ok((stream, _)) => stream,
+            let (stream, share) = match self.socket.accept().await {
+                Ok((stream, client)) => match shares.take(client.ip()) {
+                    Some(share) => (stream, share),
+                    None => continue,
+                },
                 Err(error) => {
                     log_limit::warn!(%error, "cannot accept a connection at http.listen; retrying");
                     tokio::time::sleep(PAUSE).await;
                     continue;
                 }
             };
-            let routes = routes.clone();
+            let (routes, encryption) = (routes.clone(), self.encryption.clone());
             connections.spawn(async move {
-                match answer(stream, routes).await {
-                    Some(Ok(())) => {}
-                    Some(Err(error)) => {
-                        tracing::debug!(%error, "a connection at http.listen failed")
-                    }
-                    None => tracing::debug!("a connection at http.listen took too long"),
+                match answer(stream, encryption, routes).await {
+                    Ok(Some(())) => {}
+                    Ok(None) => tracing::debug!("a connection at http.listen took too long"),
+                    Err(error) => tracing::debug!(%error, "a connection at http.listen failed"),
                 }
-                drop(place);
+                drop((place, share));
             });
         }
     }
 }
 
+/// The error of a connection.
+#[derive(Debug, thiserror::Error)]
+enum ConnectionError {
+    #[error("the handshake failed")]
+    Handshake(#[source] std::io::Error),
+    #[error(transparent)]
+    Http(#[from] hyper::Error),
+}
+
 /// Answers one request. Returns `None` if its time is over.
-async fn answer(stream: TcpStream, routes: axum::Router) -> Option<Result<(), hyper::Error>> {
+async fn answer(
+    stream: TcpStream,
+    encryption: Option<Encryption>,
+    routes: axum::Router,
+) -> Result<Option<()>, ConnectionError> {
     let timeout = u32::try_from(TAKE_TIMEOUT.as_millis()).unwrap_or(u32::MAX);
     if let Err(error) = set_tcp_user_timeout(&stream, timeout) {
         tracing::debug!(%error, "a connection at http.listen has no timeout for sent data");
     }
+    let Some(encryption) = encryption else {
+        return converse(stream, routes).await;
+    };
+    match tokio::time::timeout(HEAD_TIMEOUT, encryption.accept(stream)).await {
+        Ok(accepted) => converse(accepted.map_err(ConnectionError::Handshake)?, routes).await,
+        Err(_) => Ok(None),
+    }
+}
+
+async fn converse(
+    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    routes: axum::Router,
+) -> Result<Option<()>, ConnectionError> {
     let keep_open = KeepOpen::default();
     let routes = routes.layer(Extension(keep_open.clone()));
     let mut connection = pin!(
@@ -159,9 +205,9 @@ async fn answer(stream: TcpStream, routes: axum::Router) -> Option<Result<(), hy
             .serve_connection(TokioIo::new(stream), TowerToHyperService::new(routes))
     );
     match tokio::time::timeout(CONNECTION_TIMEOUT, &mut connection).await {
-        Ok(answered) => Some(answered),
-        Err(_) if keep_open.is_kept() => Some(connection.await),
-        Err(_) => None,
+        Ok(answered) => Ok(Some(answered?)),
+        Err(_) if keep_open.is_kept() => Ok(Some(connection.await?)),
+        Err(_) => Ok(None),
     }
 }
 
@@ -204,7 +250,7 @@ mod tests {
 
     #[tokio::test]
     async fn connections_end_with_the_listener() {
-        let listener = Listener::open("127.0.0.1:0", &[], Token::for_tests()).unwrap();
+        let listener = Listener::open("127.0.0.1:0", &[], Token::for_tests(), None).unwrap();
         let address = listener.address();
         let source = Arc::new(Stuck::default());
         let serving =

@@ -14,8 +14,8 @@ use axum::Router;
 pub struct Pages {
     /// Answers without the token: must show nothing about this host.
     pub public: Router,
-    /// Answers to clients that have sent the token or have a session. All are read-only: a request of a page of
-    /// another site that the browser passes on here must not change anything.
+    /// Answers to clients that have sent the token or have a session. Answers to GET change nothing. Other requests
+    /// come from a page of this listener: they have its `Origin` and the header `X-Fipa`.
     pub protected: Router,
 }
 

@@ -38,6 +38,24 @@ struct Admission {
     sessions: Sessions,
     /// Names of this host, in lower case.
     names: Vec<String>,
+    scheme: Scheme,
+}
+
+/// How clients reach the listener.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Scheme {
+    Http,
+    Https,
+}
+
+impl Scheme {
+    /// The beginning of its URLs.
+    fn prefix(self) -> &'static str {
+        match self {
+            Self::Http => "http://",
+            Self::Https => "https://",
+        }
+    }
 }
 
 /// Returns the answers to all requests.
@@ -45,6 +63,7 @@ pub(super) fn routes(
     source: Arc<dyn Source>,
     token: Token,
     names: Vec<String>,
+    scheme: Scheme,
     pages: Pages,
 ) -> Router {
     let names = names.iter().map(|name| name.to_ascii_lowercase()).collect();
@@ -52,6 +71,7 @@ pub(super) fn routes(
         token,
         sessions: Sessions::default(),
         names,
+        scheme,
     });
     let layer = || middleware::from_fn_with_state(Arc::clone(&admission), need_proof);
     let protected = Router::new()
@@ -128,7 +148,7 @@ async fn begin_session(
             .into_response();
     }
     let begun = admission.sessions.begin(Instant::now());
-    let cookie = begun.map(|secret| cookie(&headers, &secret, LIFETIME.as_secs()));
+    let cookie = begun.map(|secret| admission.cookie(&headers, &secret, LIFETIME.as_secs()));
     match cookie {
         Ok(cookie) => ([(SET_COOKIE, cookie)], StatusCode::NO_CONTENT).into_response(),
         Err(error) => (
@@ -144,22 +164,15 @@ async fn end_session(State(admission): State<Arc<Admission>>, headers: HeaderMap
     for secret in session_secrets(&headers) {
         admission.sessions.end(secret);
     }
-    let cookie = cookie(&headers, "", 0);
+    let cookie = admission.cookie(&headers, "", 0);
     ([(SET_COOKIE, cookie)], StatusCode::NO_CONTENT).into_response()
-}
-
-/// Returns the cookie of a session. Its name has the port, because a browser sends cookies to all ports of a host: two
-/// gateways on one host have different ones.
-fn cookie(headers: &HeaderMap, secret: &str, seconds: u64) -> String {
-    let name = cookie_name(headers);
-    format!("{name}={secret}; Path=/; Max-Age={seconds}; HttpOnly; SameSite=Strict")
 }
 
 fn cookie_name(headers: &HeaderMap) -> String {
     let host = headers.get(HOST).and_then(|host| host.to_str().ok());
     let authority = host.and_then(|host| host.parse::<Authority>().ok());
     let port = authority.and_then(|authority| authority.port_u16());
-    format!("fipa_session_{}", port.unwrap_or(80))
+    format!("fipa_session_{}", port.unwrap_or(0))
 }
 
 /// The secrets of sessions that a request has.
@@ -188,13 +201,25 @@ impl Admission {
         if matches!(*request.method(), Method::GET | Method::HEAD) {
             return None;
         }
-        let origin = only(headers, ORIGIN).and_then(|origin| origin.strip_prefix("http://"));
+        let origin =
+            only(headers, ORIGIN).and_then(|origin| origin.strip_prefix(self.scheme.prefix()));
         let is_of_page = origin.is_some_and(|origin| origin.eq_ignore_ascii_case(host));
         if is_of_page && headers.contains_key(PAGE_HEADER) {
             return None;
         }
         let why = "only the page of this listener changes something\n";
         Some((StatusCode::FORBIDDEN, why).into_response())
+    }
+
+    /// Returns the cookie of a session. Its name has the port, because a browser sends cookies to all ports of a host:
+    /// two gateways on one host have different ones.
+    fn cookie(&self, headers: &HeaderMap, secret: &str, seconds: u64) -> String {
+        let name = cookie_name(headers);
+        let secure = match self.scheme {
+            Scheme::Https => "; Secure",
+            Scheme::Http => "",
+        };
+        format!("{name}={secret}; Path=/; Max-Age={seconds}; HttpOnly; SameSite=Strict{secure}")
     }
 
     /// Whether a request has the token, or belongs to a session.
@@ -258,6 +283,7 @@ mod tests {
         let admission = Admission {
             token: Token::for_tests(),
             sessions: Sessions::default(),
+            scheme: Scheme::Http,
             names: vec!["rover.example".to_owned()],
         };
         for own in [

@@ -46,7 +46,7 @@ Examples:
 
 JSON, one line when the gateway is ready:
   { \"name\": text, \"incarnation\": text, \"domain\": text, \"locations\": [ text ],
-    \"http\": { \"address\": text, \"token_file\": text } or null without http.listen,
+    \"http\": { \"address\": text, \"url\": text, \"token_file\": text } or null without http.listen,
     \"recorder\": name of the agent that records, or null without record.directory,
     \"discovery\": { \"mdns\": true or false, \"problem\": text, if there is one },
     \"security\": { \"encrypted\": true or false, \"insecure\": security.insecure,
@@ -64,7 +64,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let (dashboard, pages) = Dashboard::start(config);
+    let (dashboard, pages) = Dashboard::start(config)?;
     let opened = Gateway::open_with_pages(config, pages).await;
     let mut gateway = opened.map_err(|error| membership::not_joined(error, config))?;
     let mut problems = gateway.discovery_problem();
@@ -163,14 +163,12 @@ fn ready(
         text.push_str(&format!("  listening on {location}\n"));
     }
     if let Some(HttpListener {
-        address,
-        token_file,
-        ..
+        url, token_file, ..
     }) = gateway.http()
     {
         let token = escape(token_file);
         text.push_str(&format!(
-            "  metrics at http://{address}/metrics, with the token in {token}\n  \
+            "  metrics at {url}/metrics, with the token in {token}\n  \
                dashboard: run `fipa dashboard` for its link\n"
         ));
     }

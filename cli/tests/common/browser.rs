@@ -59,6 +59,8 @@ impl Browser {
         let options = json!({ "args": arguments });
         let capabilities = json!({
             "goog:chromeOptions": options, "goog:loggingPrefs": { "browser": "ALL" },
+            // A gateway has a certificate of its own, without an authority.
+            "acceptInsecureCerts": true,
         });
         let created = browser.post(
             "/session",
@@ -71,6 +73,14 @@ impl Browser {
             "params": { "width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500 },
         }));
         Some(browser)
+    }
+
+    /// A command of Chromium itself.
+    pub(crate) fn chromium(&self, command: &str) {
+        self.command(
+            "/goog/cdp/execute",
+            &json!({ "cmd": command, "params": {} }),
+        );
     }
 
     pub(crate) fn go_to(&self, address: &str) {
@@ -96,6 +106,16 @@ impl Browser {
         until_some(&format!("{text:?} on the page"), || {
             self.text().contains(text).then_some(())
         });
+    }
+
+    /// The only cookie of the page.
+    pub(crate) fn cookie(&self) -> Value {
+        let path = format!("{}/cookie", self.session);
+        let head = format!("GET {path} HTTP/1.1\r\nHost: {}\r\n", self.address);
+        let mut cookies = self.exchange(&format!("{head}\r\n"));
+        let cookies = cookies.as_array_mut().unwrap();
+        assert_eq!(cookies.len(), 1, "{cookies:?}");
+        cookies.remove(0)
     }
 
     /// The messages of the browser about the page: errors of its scripts, and what its policy forbids.

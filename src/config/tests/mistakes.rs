@@ -308,8 +308,8 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[http]\nlisten = \"0.0.0.0:9790\"\n",
-            "fipa.toml:2: `http.listen` is \"0.0.0.0:9790\", which is no address of this host alone; \
-             use 127.0.0.1 or [::1] and a port, for example 127.0.0.1:9790; a proxy or an SSH tunnel serves others",
+            "fipa.toml:2: `http.listen` is \"0.0.0.0:9790\", which other hosts reach, but there is no key to encrypt \
+             with; set security.keys, or use 127.0.0.1 or [::1], for example 127.0.0.1:9790",
         ),
         // Files that are not TOML.
         (

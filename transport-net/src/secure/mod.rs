@@ -24,6 +24,7 @@ mod trust;
 mod verify;
 
 use std::fmt;
+use std::io;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -33,7 +34,10 @@ use rustls::client::Resumption;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::version::TLS13;
 use rustls::{ClientConfig, ServerConfig};
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::TcpStream;
 use tokio::sync::watch;
+use tokio_rustls::TlsAcceptor;
 
 pub use self::certificate::{
     Certificate, CertificateError, Certified, Fingerprint, alternative_names,
@@ -243,6 +247,27 @@ impl Security {
         client.resumption = Resumption::disabled();
         client.key_log = Arc::clone(&now.key_log);
         Ok(Arc::new(client))
+    }
+
+    /// Performs the handshake with a client that proves nothing, such as a browser. This host proves its key.
+    ///
+    /// # Errors
+    /// Fails if the handshake does.
+    pub async fn accept_client(
+        self,
+        stream: TcpStream,
+    ) -> io::Result<impl AsyncRead + AsyncWrite + Unpin + Send + 'static> {
+        let now = self.now.read().clone();
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let mut server = ServerConfig::builder_with_provider(provider)
+            .with_protocol_versions(&[&TLS13])
+            .map_err(io::Error::other)?
+            .with_no_client_auth()
+            .with_single_cert(vec![now.own.der().clone()], now.key.clone_key())
+            .map_err(io::Error::other)?;
+        server.send_tls13_tickets = 0;
+        server.key_log = Arc::clone(&now.key_log);
+        TlsAcceptor::from(Arc::new(server)).accept(stream).await
     }
 
     /// Returns the trust in a peer that has presented these certificates in a handshake. `None` if the

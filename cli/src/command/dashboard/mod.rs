@@ -1,10 +1,12 @@
 //! The dashboard: a page of the gateway that shows the domain, and `fipa dashboard`, which opens it.
 //!
 //! * [`observation`] observes the domain while pages show it; [`picture`] is the state of the domain.
+//! * [`orders`] sends messages for clients, if `http.control` permits it.
 //! * [`pages`] answers requests; [`view`] has the rows of a view, and their changes.
 //! * `assets/` is the page: plain JavaScript modules without a build step.
 
 mod observation;
+mod orders;
 mod pages;
 mod picture;
 mod view;
@@ -25,6 +27,8 @@ use serde_json::json;
 use tokio::task::JoinHandle;
 
 use self::observation::Observation;
+use self::orders::Orders;
+use crate::command::watch::checker;
 use crate::membership;
 use crate::options::Global;
 use crate::output;
@@ -36,13 +40,16 @@ use crate::report::Failure;
 /// links between hosts, conversations and their violations, locks, and letters with their ways. It changes nothing.
 ///
 /// The gateway must have the option http.listen. Everyone who has the link sees the domain: it contains the token of
-/// the gateway, which only the user of the gateway can read. For a tablet, forward the port through SSH.
+/// the gateway, which only the user of the gateway can read. If http.listen is an address that other hosts reach, the page
+/// is encrypted with the key of the gateway, and the browser asks once whether it may trust this key.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa up --set http.listen=127.0.0.1:9790          the gateway, with the page
   fipa dashboard                                    on the same host
   ssh -L 9790:127.0.0.1:9790 robot fipa dashboard   on another computer, which then opens the link
+  fipa up --set security.keys=$HOME/.config/fipa/keys --set http.listen=0.0.0.0:9790
+                                                    for a tablet in the same network
 
 JSON:
   { \"domain\": text, \"address\": text, \"link\": text }")]
@@ -88,7 +95,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     })?;
     // A token of the user's own may have characters that end a link or the attribute of a page.
     let token = utf8_percent_encode(token.trim_end(), NON_ALPHANUMERIC);
-    let link = format!("http://{}/#token={token}", listener.address);
+    let link = format!("{}/#token={token}", listener.url);
     if arguments.json {
         let address = listener.address.to_string();
         return output::json(&json!({ "domain": config.domain, "address": address, "link": link }));
@@ -148,15 +155,20 @@ pub(super) struct Dashboard {
 impl Dashboard {
     /// Starts the dashboard of the gateway with this configuration. Returns its pages, too. Must be called within a
     /// tokio runtime.
-    pub(super) fn start(config: &Config) -> (Self, Pages) {
-        let observation = Observation::new();
-        let pages = pages::pages(Arc::clone(&observation));
-        let observing = tokio::spawn(observation::run(Arc::clone(&observation), config.clone()));
+    ///
+    /// # Errors
+    /// Fails if a file of a protocol cannot be read.
+    pub(super) fn start(config: &Config) -> Result<(Self, Pages), Failure> {
+        let library = Arc::new(checker::protocols(&config.monitor.protocols, None)?);
+        let observation = Observation::new(Orders::new(config));
+        let pages = pages::pages(Arc::clone(&observation), Arc::clone(&library));
+        let running = observation::run(Arc::clone(&observation), library, config.clone());
+        let observing = tokio::spawn(running);
         let dashboard = Self {
             observation,
             observing,
         };
-        (dashboard, pages)
+        Ok((dashboard, pages))
     }
 
     /// Stops observing the domain, and leaves it.

@@ -6,15 +6,17 @@ use std::time::{Duration, SystemTime};
 use fipa::admin::watch::{WatchOptions, Watcher};
 use fipa::error::ErrorChain;
 use fipa::locks::ResourceStatus;
+use fipa::monitor::Library;
 use fipa::{Agent, Config, Domain, Incarnation, RegisterOptions};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, mpsc};
 use tokio::time::{Instant, MissedTickBehavior};
 
+use super::orders::Orders;
 use super::picture::{Picture, Wanted};
 use super::view::View;
 use crate::command::top::{self, Observer};
-use crate::command::watch::checker::{self, Checker};
+use crate::command::watch::checker::Checker;
 use crate::membership;
 use crate::report::Failure;
 
@@ -35,6 +37,7 @@ const RETRY: Duration = Duration::from_secs(5);
 
 /// The state of the domain for all pages.
 pub(super) struct Observation {
+    pub(super) orders: Orders,
     picture: Mutex<Picture>,
     /// Wakes the task that observes.
     wanted: Notify,
@@ -45,10 +48,12 @@ pub(super) struct Observation {
 }
 
 impl Observation {
-    pub(super) fn new() -> Arc<Self> {
+    pub(super) fn new(orders: Orders) -> Arc<Self> {
         let now = Instant::now();
+        let picture = Picture::new(orders.are_permitted());
         Arc::new(Self {
-            picture: Mutex::default(),
+            orders,
+            picture: Mutex::new(picture),
             wanted: Notify::new(),
             stopped: Notify::new(),
             last: Mutex::new(now),
@@ -63,27 +68,31 @@ impl Observation {
 
     /// Returns a view, and keeps the domain observed.
     pub(super) fn view(&self, wanted: &Wanted) -> Arc<View> {
-        let now = Instant::now();
-        *self.last.lock() = now;
         if *wanted == Wanted::Locks {
-            *self.last_locks.lock() = now;
+            *self.last_locks.lock() = Instant::now();
         }
-        self.wanted.notify_one();
+        self.keep();
         self.picture.lock().view(wanted)
+    }
+
+    /// Keeps the domain observed.
+    pub(super) fn keep(&self) {
+        *self.last.lock() = Instant::now();
+        self.wanted.notify_one();
     }
 }
 
 /// Observes the domain whenever pages show it, until it is stopped.
-pub(super) async fn run(observation: Arc<Observation>, config: Config) {
+pub(super) async fn run(observation: Arc<Observation>, library: Arc<Library>, config: Config) {
     let mut is_stopped = false;
     while !is_stopped {
         is_stopped = tokio::select! {
             () = observation.stopped.notified() => true,
             () = observation.wanted.notified() => {
-                let observed = observe(&observation, &config).await;
+                let observed = observe(&observation, &library, &config).await;
                 match observed {
                     Ok(is_stopped) => {
-                        *observation.picture.lock() = Picture::default();
+                        *observation.picture.lock() = Picture::new(observation.orders.are_permitted());
                         is_stopped
                     }
                     Err(failure) => {
@@ -98,10 +107,19 @@ pub(super) async fn run(observation: Arc<Observation>, config: Config) {
 }
 
 /// Observes the domain until no page has shown it for a while. Returns whether the task has been stopped.
-async fn observe(observation: &Observation, config: &Config) -> Result<bool, Failure> {
-    let library = checker::protocols(&config.monitor.protocols, None)?;
+async fn observe(
+    observation: &Observation,
+    library: &Arc<Library>,
+    config: &Config,
+) -> Result<bool, Failure> {
     let domain = membership::join_briefly(config).await?;
-    let observed = follow(observation, config, &domain, Checker::new(library)).await;
+    let observed = follow(
+        observation,
+        config,
+        &domain,
+        Checker::new(Arc::clone(library)),
+    )
+    .await;
     domain.close().await;
     observed
 }
@@ -146,6 +164,10 @@ async fn follow(
         () = watching => false,
         () = top::ask(asker, sender) => false,
         () = ask_for_locks(observation, &locks_asker, locks_sender) => false,
+        served = observation.orders.serve(domain, config) => {
+            served?;
+            false
+        }
         () = observation.stopped.notified() => true,
     };
     Ok(is_stopped)

@@ -5,24 +5,31 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::extract::{Path, Query, State};
+use axum::body::Bytes;
+use axum::extract::{DefaultBodyLimit, Path, Query, State};
 use axum::http::StatusCode;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::sse::{Event, Sse};
 use axum::response::{IntoResponse as _, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use axum::{Extension, Router};
+use fipa::monitor::Library;
 use fipa::web::{KeepOpen, Pages};
 use futures_util::stream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, Interval, MissedTickBehavior};
 
 use super::observation::Observation;
+use super::orders::OrderError;
 use super::picture::Wanted;
 use super::view::View;
+use crate::command::protocol::drawing;
 
 /// Maximum number of pages that follow the domain at the same time.
 const MAX_STREAMS: usize = 16;
+
+/// Maximum size of an order, in bytes.
+const MAX_ORDER: usize = 64 << 10;
 
 /// Minimum time between two changes that a page gets.
 const PACE: Duration = Duration::from_millis(200);
@@ -31,7 +38,7 @@ const PACE: Duration = Duration::from_millis(200);
 const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
 
 /// The parts of the page: path, media type, content.
-const PARTS: [(&str, &str, &str); 11] = [
+const PARTS: [(&str, &str, &str); 15] = [
     (
         "/",
         "text/html; charset=utf-8",
@@ -43,6 +50,14 @@ const PARTS: [(&str, &str, &str); 11] = [
         include_str!("assets/openapi.json"),
     ),
     ("/style.css", CSS, include_str!("assets/style.css")),
+    ("/uplot.css", CSS, include_str!("assets/uplot.css")),
+    ("/uplot.js", JAVASCRIPT, include_str!("assets/uplot.js")),
+    (
+        "/uplot.license",
+        "text/plain; charset=utf-8",
+        include_str!("assets/uplot.license"),
+    ),
+    ("/chart.js", JAVASCRIPT, include_str!("assets/chart.js")),
     ("/main.js", JAVASCRIPT, include_str!("assets/main.js")),
     ("/live.js", JAVASCRIPT, include_str!("assets/live.js")),
     (
@@ -70,13 +85,15 @@ const JAVASCRIPT: &str = "text/javascript; charset=utf-8";
 #[derive(Clone)]
 struct Shown {
     observation: Arc<Observation>,
+    library: Arc<Library>,
     places: Arc<Semaphore>,
 }
 
 /// Returns the pages that show what is observed.
-pub(super) fn pages(observation: Arc<Observation>) -> Pages {
+pub(super) fn pages(observation: Arc<Observation>, library: Arc<Library>) -> Pages {
     let shown = Shown {
         observation,
+        library,
         places: Arc::new(Semaphore::new(MAX_STREAMS)),
     };
     let part =
@@ -88,6 +105,9 @@ pub(super) fn pages(observation: Arc<Observation>) -> Pages {
         };
     let protected = Router::new()
         .route("/api/live/{view}", get(live))
+        .route("/api/protocol.svg", get(protocol))
+        .route("/api/send", post(send))
+        .layer(DefaultBodyLimit::max(MAX_ORDER))
         .route("/api/{view}", get(snapshot))
         .with_state(shown);
     Pages {
@@ -137,6 +157,39 @@ async fn snapshot(
             ([(CONTENT_TYPE, "application/json")], json).into_response()
         }
         Err(refusal) => refusal.into_response(),
+    }
+}
+
+/// Answers with the drawing of a protocol, in which a state is marked.
+async fn protocol(
+    State(shown): State<Shown>,
+    Query(parameters): Query<HashMap<String, String>>,
+) -> Response {
+    let parameter = |name: &str| parameters.get(name).map(String::as_str);
+    let machine = parameter("name").and_then(|name| shown.library.find(name));
+    let Some(machine) = machine else {
+        return (StatusCode::NOT_FOUND, "the protocol is not known\n").into_response();
+    };
+    let svg = drawing::svg(machine, false, parameter("state"));
+    ([(CONTENT_TYPE, "image/svg+xml")], svg).into_response()
+}
+
+/// Sends a message, and answers with its outcomes.
+async fn send(State(shown): State<Shown>, order: Bytes) -> Response {
+    shown.observation.keep();
+    match shown.observation.orders.send(&order).await {
+        Ok(outcomes) => {
+            let json = outcomes.to_string();
+            ([(CONTENT_TYPE, "application/json")], json).into_response()
+        }
+        Err(error) => {
+            let status = match error {
+                OrderError::NoControl => StatusCode::FORBIDDEN,
+                OrderError::NotReady => StatusCode::SERVICE_UNAVAILABLE,
+                _ => StatusCode::BAD_REQUEST,
+            };
+            (status, format!("{error}\n")).into_response()
+        }
     }
 }
 

@@ -6,8 +6,13 @@ use fipa_drawing::{Automaton, Row};
 
 use super::{CONDITIONS, act, conditions, defaults, role, within};
 
-/// Draws a protocol, with the transitions that every protocol has if `with_defaults` is set.
-pub(super) fn svg(machine: &Machine, with_defaults: bool) -> String {
+/// Draws a protocol, with the transitions that every protocol has if `with_defaults` is set, and with the state of this
+/// name marked.
+pub(in crate::command) fn svg(
+    machine: &Machine,
+    with_defaults: bool,
+    current: Option<&str>,
+) -> String {
     let title = match machine.title() {
         Some(title) => format!("{}: {title}", machine.name()),
         None => machine.name().to_owned(),
@@ -28,6 +33,7 @@ pub(super) fn svg(machine: &Machine, with_defaults: bool) -> String {
         roles: roles.iter().map(|role| escaped(role)).collect(),
         states,
         initial: initial.unwrap_or_default(),
+        current: current.and_then(|state| number(machine, state)),
         legend: CONDITIONS.map(str::to_owned).into(),
     }
     .svg()

@@ -1,7 +1,7 @@
 //! `fipa protocol`: lists, shows, checks and draws interaction protocols.
 
 mod defaults;
-mod drawing;
+pub(in crate::command) mod drawing;
 mod mermaid;
 
 use std::path::{Path, PathBuf};
@@ -167,7 +167,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         } => {
             let machine = find(&protocol, global)?;
             let drawn = match format {
-                Format::Svg => drawing::svg(&machine, defaults),
+                Format::Svg => drawing::svg(&machine, defaults, None),
                 Format::Mermaid => mermaid::diagram(&machine, defaults),
             };
             write(&drawn, output)

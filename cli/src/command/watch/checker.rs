@@ -167,8 +167,8 @@ pub(in crate::command) fn protocols(
 
 impl Checker {
     /// Creates a checker with these protocols.
-    pub(in crate::command) fn new(library: Library) -> Self {
-        let library = Arc::new(library);
+    pub(in crate::command) fn new(library: impl Into<Arc<Library>>) -> Self {
+        let library = library.into();
         Self {
             monitor: Monitor::observer(Arc::clone(&library)),
             library,

@@ -89,7 +89,8 @@ pub(in crate::command) fn later_object(passage: &Passage) -> Map<String, Value> 
     object
 }
 
-fn fate(object: &mut Map<String, Value>, fate: &Fate) {
+/// Adds the state of a delivery.
+pub(in crate::command) fn fate(object: &mut Map<String, Value>, fate: &Fate) {
     let outcome = match fate {
         Fate::UnderWay => {
             object.insert("outcome".to_owned(), "under_way".into());

@@ -82,12 +82,29 @@ function sequence(letters) {
   }, lanes, arrows);
 }
 
+/** The state machine of the protocol of a conversation, with its state. The facts above have the same as text. */
+function showMachine(machine, box, row) {
+  box.hidden = !row?.protocol || machine.dataset.missing === row.protocol;
+  if (box.hidden) return;
+  const address = `api/protocol.svg?name=${encodeURIComponent(row.protocol)}&state=${encodeURIComponent(row.state ?? '')}`;
+  if (machine.getAttribute('src') === address) return;
+  machine.onerror = () => {
+    machine.dataset.missing = row.protocol;
+    box.hidden = true;
+  };
+  machine.alt = `State machine of ${row.protocol}, in state ${row.state ?? 'unknown'}`;
+  machine.src = address;
+}
+
 export function conversation(id) {
   const about = element('dl', { class: 'totals' });
   const found = element('div', { role: 'status' });
   const diagram = element('div', { class: 'card wide' });
+  const machine = element('img', { alt: '' });
+  const machineBox = element('div', { class: 'card wide machine', hidden: true }, machine);
   const letters = letterTable(true);
-  const node = element('div', {}, element('h2', {}, id), about, found, diagram,
+  const node = element('div', {}, element('h2', {}, id), about, found,
+    element('div', { class: 'beside' }, diagram, machineBox),
     element('details', { open: true }, element('summary', {}, 'The letters as a table'), letters.node));
   const update = (sections) => {
     const row = sections.conversation?.[id];
@@ -102,6 +119,7 @@ export function conversation(id) {
     found.replaceChildren(...violations.map((letter) => element('p', { class: 'bad-text' },
       `${clock(letter.time)}: ${letter.violation}`)));
     diagram.replaceChildren(sequence(all));
+    showMachine(machine, machineBox, row);
     letters.show(sections.letters ?? {});
   };
   return { node, path: `conversation?id=${encodeURIComponent(id)}`, update };

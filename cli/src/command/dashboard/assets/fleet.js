@@ -1,6 +1,7 @@
 // Hosts with their agents, and one agent.
 
 import { clock, element, link, problems, rate, seconds, span, table } from './elements.js';
+import { chart } from './chart.js';
 import { conversationTable } from './conversations.js';
 import { letterTable } from './letters.js';
 
@@ -78,13 +79,15 @@ function totals(values) {
 
 export function fleet() {
   const numbers = element('dl', { class: 'totals' });
+  const rates = chart();
   const hosts = element('div', { class: 'hosts' });
   const cards = new Map();
-  const update = ({ domain, hosts: peers = {}, agents = {} }) => {
+  const update = ({ domain, hosts: peers = {}, agents = {}, history = {} }) => {
     const values = domain?.totals;
     if (values?.host === undefined) return;
     document.getElementById('title').textContent = `${values.domain} on ${values.host}`;
     numbers.replaceChildren(...totals(values));
+    rates.show(history);
     const own = values.gateway ?? values.host;
     const groups = new Map([[own, []]]);
     for (const name of Object.keys(peers).sort()) if (name !== own) groups.set(name, []);
@@ -109,24 +112,80 @@ export function fleet() {
       }
     }
   };
-  return { node: element('div', {}, numbers, hosts), path: 'fleet', update };
+  return { node: element('div', {}, numbers, rates.node, hosts), path: 'fleet', update };
+}
+
+const PERFORMATIVES = ['request', 'inform', 'query-ref', 'query-if', 'cancel', 'subscribe', 'cfp', 'accept-proposal',
+  'reject-proposal', 'agree', 'refuse', 'failure', 'not-understood'];
+
+/** A form that sends a message to an agent. Everything that it does is seen in the fleet. */
+function messageForm(to) {
+  const field = (title, node) => element('label', {}, title, node);
+  const input = (name) => element('input', { name, autocomplete: 'off' });
+  const [protocol, conversation] = [input('protocol'), input('conversation')];
+  const performative = element('select', { name: 'performative' },
+    PERFORMATIVES.map((name) => element('option', { value: name }, name)));
+  const content = element('textarea', { name: 'content', rows: 2, cols: 40 });
+  const result = element('p', { role: 'status' });
+  const submit = async (event) => {
+    event.preventDefault();
+    result.textContent = 'sending';
+    const order = { to, performative: performative.value };
+    for (const { name, value } of [protocol, conversation, content]) if (value) order[name] = value;
+    const answer = await fetch('api/send', {
+      method: 'POST', headers: { 'X-Fipa': '1', 'Content-Type': 'application/json' }, body: JSON.stringify(order),
+    }).catch((error) => ({ ok: false, text: () => error.message }));
+    if (!answer.ok) result.textContent = (await answer.text()).trim();
+    else {
+      const { deliveries } = await answer.json();
+      result.textContent = deliveries.map((one) => `${one.receiver}: ${one.outcome} ${one.reason ?? `via ${one.via}`}`).join('; ');
+    }
+  };
+  return element('details', { class: 'card', hidden: true },
+    element('summary', {}, `Send a message to ${to}`),
+    element('form', { on: { submit } }, field('Performative', performative), field('Protocol', protocol),
+      field('Conversation', conversation), field('Content', content), element('button', {}, 'Send')),
+    result);
+}
+
+function partnerRow(row) {
+  return element('tr', {}, element('td', { class: 'name' }, link('agent', row.name)),
+    element('td', { class: 'number' }, String(row.sent)), element('td', { class: 'number' }, String(row.received)),
+    element('td', { class: 'bad-text' }, problems(row)));
+}
+
+function reasonRow(row) {
+  return element('tr', {}, element('td', {}, row.reason),
+    element('td', { class: 'number bad-text' }, String(row.failures)));
 }
 
 export function agent(name) {
+  const partners = table('Among the newest letters', [{ title: 'Partner' }, { title: 'Sent to', class: 'number' },
+    { title: 'Received from', class: 'number' }, { title: 'Problems' }], partnerRow);
+  const reasons = table('Letters of this agent that were not delivered', [{ title: 'Reason' },
+    { title: 'Letters', class: 'number' }], reasonRow);
+  const reasonBox = element('div', { class: 'card' }, reasons.node);
+  const form = messageForm(name);
   const about = element('dl', { class: 'totals' });
   const talks = conversationTable();
   const letters = letterTable();
   const node = element('div', {},
-    element('h2', {}, name), about,
+    element('h2', {}, name), about, form,
+    element('h3', {}, 'Partners'), element('div', { class: 'beside' },
+      element('div', { class: 'card' }, partners.node), reasonBox),
     element('h3', {}, 'Conversations'), talks.node, element('h3', {}, 'Letters'), letters.node);
   const update = (sections) => {
     const row = sections.agent?.[name];
+    form.hidden = !sections.domain?.totals?.control;
     const facts = row
       ? [['Host', row.host ?? 'this host'], ['Type', row.type || '–'], ['Since', clock(row.registered)],
         ['State', row.ended ? `ended ${clock(row.ended)}` : 'in the directory', Boolean(row.ended)]]
       : [['State', 'not in the directory', true]];
     about.replaceChildren(...facts.map(([title, value, isBad]) => element('div', {},
       element('dt', {}, title), element('dd', { class: isBad ? 'bad-text' : null }, value))));
+    partners.rows.show(Object.entries(sections.partners ?? {}));
+    reasons.rows.show(Object.entries(sections.reasons ?? {}));
+    reasonBox.hidden = Object.keys(sections.reasons ?? {}).length === 0;
     talks.show(sections.conversations ?? {});
     letters.show(sections.letters ?? {});
   };

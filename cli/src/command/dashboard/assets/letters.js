@@ -7,11 +7,13 @@ const COLUMNS = [
   { title: 'Outcome' },
 ];
 
+const OUTCOMES = { under_way: 'under way', taken: 'received' };
+
 function outcome(fate) {
   const attempts = (fate.attempts ?? []).map((attempt) =>
     element('li', {}, `${attempt.via} to ${attempt.location}: ${attempt.error}`));
   const text = element('span', { class: fate.outcome === 'failed' ? 'bad-text' : null },
-    fate.reason ? `${fate.outcome}: ${fate.reason}` : fate.outcome);
+    fate.reason ? `${fate.outcome}: ${fate.reason}` : OUTCOMES[fate.outcome] ?? fate.outcome);
   return attempts.length === 0 ? [text]
     : [text, element('details', {}, element('summary', {}, `${attempts.length} failed attempts`), element('ul', {}, attempts))];
 }

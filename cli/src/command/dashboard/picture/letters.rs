@@ -4,10 +4,11 @@ use std::collections::VecDeque;
 
 use fipa::Outcome;
 use fipa::admin::watch::{Fate, Passage};
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use super::{clipped, moment};
 use crate::command::watch::checker::CheckResult;
+use crate::command::watch::json;
 
 /// Maximum number of letters.
 const MAX_LETTERS: usize = 5000;
@@ -25,8 +26,8 @@ pub(super) struct Letter {
     size: u64,
     via: Option<&'static str>,
     gateway: Option<String>,
-    fate: Value,
-    violation: Option<String>,
+    fate: Map<String, Value>,
+    pub(super) violation: Option<String>,
     pub(super) has_failed: bool,
 }
 
@@ -44,7 +45,7 @@ impl Letter {
             size: passage.size,
             via: None,
             gateway: None,
-            fate: Value::Null,
+            fate: Map::new(),
             violation: match checked {
                 CheckResult::Violation(violation) => Some(clipped(&violation.to_string())),
                 _ => None,
@@ -60,7 +61,13 @@ impl Letter {
         self.via = passage.via.map(fipa::Kind::name);
         self.gateway = passage.gateway.as_deref().map(clipped);
         self.has_failed = matches!(&passage.fate, Fate::Settled(Outcome::Failed { .. }));
-        self.fate = fate(&passage.fate);
+        self.fate = Map::new();
+        json::fate(&mut self.fate, &passage.fate);
+    }
+
+    /// The reason why it was not delivered.
+    pub(super) fn reason(&self) -> Option<&str> {
+        self.fate.get("reason").and_then(Value::as_str)
     }
 
     /// The row of the letter.
@@ -72,28 +79,6 @@ impl Letter {
             "violation": self.violation,
         })
     }
-}
-
-/// State of the delivery: outcome, reason of a failure, and each attempt.
-fn fate(fate: &Fate) -> Value {
-    let outcome = match fate {
-        Fate::UnderWay => return json!({ "outcome": "under way" }),
-        Fate::Taken => return json!({ "outcome": "received" }),
-        Fate::Passed(outcome) | Fate::Settled(outcome) => outcome,
-    };
-    let (word, reason) = match outcome {
-        Outcome::Delivered { .. } => ("delivered", None),
-        Outcome::Sent { .. } => ("sent", None),
-        Outcome::Failed { reason, .. } => ("failed", Some(reason.to_string())),
-        _ => ("unknown", None),
-    };
-    let attempts = outcome.attempts().iter().map(|attempt| {
-        json!({
-            "via": attempt.via.name(), "location": clipped(&attempt.location.to_string()),
-            "error": clipped(&attempt.error.to_string()),
-        })
-    });
-    json!({ "outcome": word, "reason": reason.map(|it| clipped(&it)), "attempts": attempts.collect::<Vec<_>>() })
 }
 
 /// The newest letters in the order of their numbers.

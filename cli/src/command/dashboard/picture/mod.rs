@@ -4,7 +4,9 @@
 
 mod agents;
 mod conversations;
+mod history;
 mod letters;
+mod partners;
 
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -16,7 +18,9 @@ use serde_json::{Value, json};
 
 use self::agents::Agents;
 use self::conversations::Conversations;
+use self::history::History;
 use self::letters::{Letter, Letters};
+use self::partners::Partners;
 use super::view::View;
 use crate::command::locks;
 use crate::command::top::{Snapshot, peer_object, totals_object};
@@ -38,11 +42,14 @@ pub(super) struct Picture {
     agents: Agents,
     conversations: Conversations,
     letters: Letters,
+    history: History,
     locks: Vec<ResourceStatus>,
     /// The fleet at the last look.
     fleet: Arc<View>,
     /// The reason why the domain cannot be observed.
     problem: Option<String>,
+    /// Whether clients may send messages.
+    has_control: bool,
 }
 
 /// A view with its parameter.
@@ -63,6 +70,14 @@ pub(super) enum Wanted {
 }
 
 impl Picture {
+    /// An empty picture.
+    pub(super) fn new(has_control: bool) -> Self {
+        Self {
+            has_control,
+            ..Self::default()
+        }
+    }
+
     /// Handles an event of a letter; `checked` is the result of the check of a new one.
     pub(super) fn handle(&mut self, event: &Event, checked: Option<&CheckResult>) {
         match (event, checked) {
@@ -85,12 +100,17 @@ impl Picture {
     pub(super) fn look(&mut self, now: SystemTime, entries: &[Arc<Entry>], counted: &Snapshot) {
         self.problem = None;
         self.agents.look(now, entries);
+        self.history.add(now, counted);
         let mut fleet = View::default();
-        for section in ["agents", "hosts"] {
+        for section in ["agents", "hosts", "history"] {
             fleet.section(section);
         }
-        let totals = Value::Object(totals_object(counted));
-        fleet.put("domain", "totals", &totals);
+        for (second, point) in self.history.points() {
+            fleet.put("history", second.to_string(), point);
+        }
+        let mut totals = totals_object(counted);
+        totals.insert("control".to_owned(), self.has_control.into());
+        fleet.put("domain", "totals", &Value::Object(totals));
         for peer in &counted.peers {
             fleet.put("hosts", clipped(&peer.name), &peer_object(peer));
         }
@@ -130,9 +150,17 @@ impl Picture {
 
     fn agent(&self, name: &str) -> View {
         let mut view = self.newest_letters(|letter| letter.from == name || letter.to == name);
-        for section in ["agent", "conversations"] {
+        for section in ["agent", "conversations", "partners", "reasons"] {
             view.section(section);
         }
+        let partners = Partners::of(name, self.letters.newest());
+        for (partner, row) in partners.rows() {
+            view.put("partners", partner, &row);
+        }
+        for (reason, row) in partners.reasons() {
+            view.put("reasons", reason, &row);
+        }
+        view.put("domain", "totals", &json!({ "control": self.has_control }));
         if let Some(row) = self.agents.row(name) {
             view.put("agent", name, &row);
         }
@@ -193,7 +221,7 @@ impl Picture {
 }
 
 /// The beginning of a text.
-fn clipped(text: &str) -> String {
+pub(super) fn clipped(text: &str) -> String {
     match text.char_indices().nth(MAX_TEXT) {
         Some((end, _)) => format!("{}…", text.get(..end).unwrap_or_default()),
         None => text.to_owned(),

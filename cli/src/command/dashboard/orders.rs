@@ -1,0 +1,143 @@
+//! Messages that a client of the page sends, as the agent `dashboard@<mts.name>`. The rules of access of the receivers
+//! apply to it as to every agent.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa::error::ErrorChain;
+use fipa::{Agent, Config, Domain, Performative, RegisterOptions};
+use serde::Deserialize;
+use serde_json::{Value, json};
+use tokio::sync::watch;
+
+use super::picture::clipped;
+use crate::membership;
+use crate::report::Failure;
+
+/// Maximum wait for the outcome of a message.
+const WITHIN: Duration = Duration::from_secs(10);
+
+/// A message to send.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Order {
+    to: String,
+    performative: String,
+    content: Option<String>,
+    language: Option<String>,
+    ontology: Option<String>,
+    protocol: Option<String>,
+    conversation: Option<String>,
+}
+
+/// The error of an order.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub(super) enum OrderError {
+    /// Clients may only see.
+    #[error("http.control is false: the page only shows the domain")]
+    NoControl,
+    /// The agent is not registered.
+    #[error("the agent of the page cannot be registered; see the log of the gateway")]
+    NotReady,
+    /// It is not an order.
+    #[error("not an order: {0}")]
+    Malformed(#[from] serde_json::Error),
+    /// Its performative is none.
+    #[error("{0:?} is no performative")]
+    Performative(String),
+    /// The message cannot be sent.
+    #[error("{}", ErrorChain(.0))]
+    Send(#[from] fipa::error::SendError),
+}
+
+/// The agent of the page.
+#[derive(Debug)]
+pub(super) struct Orders {
+    is_permitted: bool,
+    agent: watch::Sender<Option<Arc<Agent>>>,
+}
+
+impl Orders {
+    pub(super) fn new(config: &Config) -> Self {
+        Self {
+            is_permitted: config.http.control,
+            agent: watch::Sender::default(),
+        }
+    }
+
+    /// Whether clients may send messages.
+    pub(super) fn are_permitted(&self) -> bool {
+        self.is_permitted
+    }
+
+    /// Registers the agent, and reads its letters until the future is dropped: the page shows them as all others. Never
+    /// ends if clients may only see.
+    pub(super) async fn serve(&self, domain: &Domain, config: &Config) -> Result<(), Failure> {
+        if !self.is_permitted {
+            return std::future::pending().await;
+        }
+        let name = format!("dashboard@{}", config.mts.name);
+        let options = RegisterOptions {
+            agent_type: "fipa-dashboard".to_owned(),
+            description: "sends messages of the web page of this gateway".to_owned(),
+        };
+        let agent = Arc::new(membership::register(domain, &name, options, config).await?);
+        let _left = Left(&self.agent);
+        self.agent.send_replace(Some(Arc::clone(&agent)));
+        while agent.receive().await.is_ok() {}
+        Ok(())
+    }
+
+    /// Sends a message, and returns its outcomes in the JSON of `fipa send`. Waits for the registration of the agent.
+    ///
+    /// # Errors
+    /// If clients may only see, or the order is not valid.
+    pub(super) async fn send(&self, order: &[u8]) -> Result<Value, OrderError> {
+        if !self.is_permitted {
+            return Err(OrderError::NoControl);
+        }
+        let Order {
+            to,
+            performative,
+            content,
+            language,
+            ontology,
+            protocol,
+            conversation,
+        } = serde_json::from_slice(order)?;
+        let known: Result<Performative, _> = performative.parse();
+        let performative = known.map_err(|_| OrderError::Performative(clipped(&performative)))?;
+        let mut agent = self.agent.subscribe();
+        let registered = tokio::time::timeout(WITHIN, agent.wait_for(Option::is_some)).await;
+        let agent = registered.ok().and_then(|agent| agent.ok()?.clone());
+        let agent = agent.ok_or(OrderError::NotReady)?;
+        let mut message = agent.message(performative).receiver(to);
+        if let Some(content) = content {
+            message = message.content(content);
+        }
+        if let Some(language) = language {
+            message = message.language(language);
+        }
+        if let Some(ontology) = ontology {
+            message = message.ontology(ontology);
+        }
+        if let Some(protocol) = protocol {
+            message = message.protocol(protocol);
+        }
+        if let Some(conversation) = conversation {
+            message = message.conversation_id(conversation);
+        }
+        let deliveries = agent.send_within(message, WITHIN).await?;
+        Ok(json!({ "deliveries": deliveries }))
+    }
+}
+
+/// Takes the agent away at the end, so that it leaves the domain with its owner.
+struct Left<'a>(&'a watch::Sender<Option<Arc<Agent>>>);
+
+impl Drop for Left<'_> {
+    fn drop(&mut self) {
+        self.0.send_replace(None);
+    }
+}
