@@ -77,6 +77,10 @@ impl Seen {
         let mut entry = entry.clone();
         if entry.name.starts_with("arm") {
             entry.reach = self.reach;
+        } else {
+            entry.reach = Reach::Remote {
+                gateway: service(1),
+            };
         }
         Arc::new(entry)
     }
@@ -211,6 +215,10 @@ impl Path {
             };
             let arm = Registration::new(format!("arm_{stream}"), arm(stream), locations);
             directory.register(arm).unwrap();
+        }
+        if at == RECEIVER - 1 {
+            let rover = Registration::new("rover", rover(), vec![location(at, at - 1)]);
+            directory.register(rover).unwrap();
         }
         let is_gateway = at != SENDER && at != RECEIVER;
         let config = CoreConfig {

@@ -669,6 +669,65 @@ fn a_peer_that_invents_senders_makes_few_of_them_known() {
     assert_eq!(later, 50);
 }
 
+/// Number of letters that are handed over, after the requested refreshes.
+fn handed_over(bench: &mut Bench) -> usize {
+    let mut letters = 0;
+    while let Some(action) = bench.core.poll_action() {
+        match action {
+            Action::Dispatch { parcel, .. } if matches!(parcel.body, Body::Letter(_)) => {
+                letters += 1;
+            }
+            Action::Refresh { number } => bench.core.handle_refreshed(bench.now, number),
+            _ => {}
+        }
+    }
+    letters
+}
+
+/// An agent that registers often is announced by its gateway, and can then be answered.
+#[test]
+fn a_letter_of_an_agent_beyond_the_limit_waits_for_the_announcement() {
+    let mut bench = Bench::with(&[]);
+    for (number, count) in [(1000, 1), (1001, 1), (1002, 0)] {
+        let stream = (Incarnation::from_u64(number), ARM);
+        let verdict = bench.letter(link(LIAR, LIAR), stream, 1);
+        assert_eq!(verdict, Reaction::Later);
+        assert_eq!(handed_over(&mut bench), count);
+    }
+    for (wait, count) in [(499, 0), (1, 1)] {
+        bench.now.instant += Duration::from_millis(wait);
+        bench.core.handle_timeout(bench.now);
+        assert_eq!(handed_over(&mut bench), count);
+    }
+}
+
+/// The receiver may answer at once, and must find the sender in the directory of its own process.
+#[test]
+fn the_first_letter_of_an_agent_waits_until_its_host_sees_it() {
+    let crane = Incarnation::from_u64(99);
+    let mut bench = Bench::with(&[("rover", ROVER, HONEST), ("crane", crane, HONEST)]);
+    let view = bench.core.set_view(Arc::new(MergedDirectory::new(vec![])));
+    bench.core.set_view(view);
+    bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
+    let refresh = bench.core.poll_action();
+    let Some(Action::ContactSeenAgain { .. }) = refresh else {
+        panic!("{refresh:?}");
+    };
+    let refresh = bench.core.poll_action();
+    let Some(Action::Refresh { number }) = refresh else {
+        panic!("{refresh:?}");
+    };
+    assert!(bench.core.poll_action().is_none());
+    bench.core.handle_published();
+    bench.core.handle_refreshed(bench.now, number);
+    assert_eq!(handed_over(&mut bench), 1);
+    // The next agent is published, too.
+    bench.letter(link(HONEST, HONEST), (crane, ARM), 1);
+    let actions = std::iter::from_fn(|| bench.core.poll_action());
+    let refreshes = actions.filter(|it| matches!(it, Action::Refresh { .. }));
+    assert_eq!(refreshes.count(), 0);
+}
+
 /// The state of a small letter takes more memory than its bytes.
 #[test]
 fn small_letters_take_bounded_memory() {

@@ -171,7 +171,8 @@ impl ContactDirectory {
     }
 
     /// Records that an agent of another host sent a letter at `now`; letters to it go to
-    /// `location`, which has the incarnation of the message transport service there. Returns what is new.
+    /// `location`, which has the incarnation of the message transport service there. Returns the contact
+    /// that made room; its time of registration is that of this change.
     ///
     /// # Errors
     /// Fails when the name is not valid, another host has it, or there is no room.
@@ -181,7 +182,7 @@ impl ContactDirectory {
         name: &str,
         incarnation: Incarnation,
         location: Location,
-    ) -> Result<ContactChange, ContactError> {
+    ) -> Result<Option<Arc<Entry>>, ContactError> {
         self.record(now, (name, incarnation), vec![location], None, false)
     }
 
@@ -196,7 +197,7 @@ impl ContactDirectory {
         name: &str,
         location: Location,
         host_name: &str,
-    ) -> Result<ContactChange, ContactError> {
+    ) -> Result<Option<Arc<Entry>>, ContactError> {
         let agent = (name, Incarnation::UNKNOWN);
         self.record(now, agent, vec![location], Some(host_name), false)
     }
@@ -213,7 +214,7 @@ impl ContactDirectory {
         name: &str,
         locations: Vec<Location>,
         is_given: bool,
-    ) -> Result<ContactChange, ContactError> {
+    ) -> Result<Option<Arc<Entry>>, ContactError> {
         if locations.is_empty() {
             return Err(ContactError::NoLocation);
         }
@@ -228,7 +229,7 @@ impl ContactDirectory {
         locations: Vec<Location>,
         host_name: Option<&str>,
         is_given: bool,
-    ) -> Result<ContactChange, ContactError> {
+    ) -> Result<Option<Arc<Entry>>, ContactError> {
         let first = locations.first();
         let gateway = first.map_or(Incarnation::UNKNOWN, Location::incarnation);
         let host = PeerId::of(Principal::Unproved, first);
@@ -256,7 +257,7 @@ impl ContactDirectory {
                         contact.host_name = Some(host_name.into());
                     }
                 });
-                return Ok(ContactChange::default());
+                return Ok(None);
             }
             let is_in_use = now.saturating_duration_since(known.used) < Self::SILENCE;
             let is_same = known.host == host
@@ -267,7 +268,6 @@ impl ContactDirectory {
                 return Err(taken.map_or(ContactError::Full, |it| ContactError::Taken(it.clone())));
             }
         }
-        let is_new = known.is_none_or(|known| known.entry.incarnation != incarnation);
         let before = contacts.remove(name);
         let replaced = match contacts.make_room(&host) {
             Ok(replaced) => replaced.map(|it| self.replace(&mut contacts, it)),
@@ -299,7 +299,7 @@ impl ContactDirectory {
             used: now,
             last_letter: now,
         });
-        Ok(ContactChange { is_new, replaced })
+        Ok(replaced)
     }
 
     /// Takes a contact that made room out of the directory. Its entry tells senders when.
@@ -405,15 +405,6 @@ impl ContactDirectory {
     }
 }
 
-/// What a letter changed in the contacts.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct ContactChange {
-    /// Whether this incarnation of the sender was not a contact before.
-    pub is_new: bool,
-    /// The contact that made room. Its time of registration is that of this change.
-    pub replaced: Option<Arc<Entry>>,
-}
-
 impl Default for ContactDirectory {
     fn default() -> Self {
         Self::new()
@@ -437,26 +428,19 @@ mod tests {
         Incarnation::from_u64(number)
     }
 
-    fn is_new() -> Result<ContactChange, ContactError> {
-        Ok(ContactChange {
-            is_new: true,
-            replaced: None,
-        })
-    }
-
     #[test]
     fn a_sender_is_a_contact_without_an_end_by_time() {
         let contacts = ContactDirectory::new();
         let start = Instant::now();
         let record =
             |at, number| contacts.record_sender(at, "arm", incarnation(number), location());
-        assert_eq!(record(start, 1), is_new());
-        assert_eq!(record(start, 1), Ok(ContactChange::default()));
+        assert_eq!(record(start, 1), Ok(None));
+        assert_eq!(record(start, 1), Ok(None));
         let entry = contacts.lookup("arm").unwrap();
         assert_eq!(entry.locations, [location()]);
         assert_eq!(contacts.by_incarnation(incarnation(1)).unwrap(), entry);
         // Another incarnation at the same gateway replaces it.
-        assert_eq!(record(start, 2), is_new());
+        assert_eq!(record(start, 2), Ok(None));
         assert!(contacts.by_incarnation(incarnation(1)).is_none());
         let month = start + Duration::from_secs(30 * 24 * 60 * 60);
         let next = contacts.forget(month, &nothing());
@@ -533,14 +517,14 @@ mod tests {
         contacts.record_further_letter(silent, "echo@jade");
         let later = silent + ContactDirectory::SILENCE;
         assert_eq!(record(just_before(later), "192.0.2.2"), taken);
-        assert_eq!(record(later, "192.0.2.2").map(|it| it.is_new), Ok(false));
+        assert_eq!(record(later, "192.0.2.2"), Ok(None));
         let entry = contacts.lookup("echo@jade").unwrap();
         assert_eq!(entry.locations, [jade("192.0.2.2")]);
         // On its own host, its port may change at any time.
         let moved: Location = "http://192.0.2.2:7779/acc".parse().unwrap();
         let record =
             contacts.record_sender(later, "echo@jade", Incarnation::UNKNOWN, moved.clone());
-        assert_eq!(record, Ok(ContactChange::default()));
+        assert_eq!(record, Ok(None));
         let entry = contacts.lookup("echo@jade").unwrap();
         assert_eq!(entry.locations, [moved]);
     }
@@ -557,7 +541,7 @@ mod tests {
             let (name, location) = (format!("arm {number}"), at.parse().unwrap());
             let record =
                 contacts.record_sender(Instant::now(), &name, incarnation(number), location);
-            assert_eq!(record, is_new(), "{at}");
+            assert_eq!(record, Ok(None), "{at}");
             assert_eq!(contacts.lookup(&name).unwrap().mts.name, None);
         }
     }
@@ -617,7 +601,7 @@ mod tests {
         contacts: &ContactDirectory,
         host: u8,
         numbers: std::ops::Range<usize>,
-    ) -> Vec<ContactChange> {
+    ) -> Vec<Option<Arc<Entry>>> {
         let record = numbers.map(|number| {
             let (name, location) = (format!("{host} {number}"), at_host(host));
             let record =
@@ -637,14 +621,14 @@ mod tests {
         fill(&contacts, 2, 0..1);
         let most = ContactDirectory::MAX_OF_HOST;
         let record = fill(&contacts, 1, 0..most);
-        assert!(record.iter().all(|it| it.replaced.is_none()));
+        assert!(record.iter().all(Option::is_none));
         // The first was answered, the second is the subject of a subscription here, the third was heard again.
         contacts.took(Instant::now(), "1 0");
         contacts.pin(HashSet::from(["1 1".into()]));
         contacts.record_further_letter(Instant::now(), "1 2");
         for (number, name) in (most..).zip(["1 3", "1 4"]) {
             let record = fill(&contacts, 1, number..number + 1).remove(0);
-            assert_eq!(&*record.replaced.unwrap().name, name);
+            assert_eq!(&*record.unwrap().name, name);
             assert!(contacts.lookup(name).is_none());
             assert_eq!(&*contacts.view().lost_agent(name).unwrap().name, name);
         }
@@ -695,7 +679,7 @@ mod tests {
         all.iter()
             .for_each(|it| contacts.took(Instant::now(), &it.name));
         let record = fill(&contacts, 99, 0..1).remove(0);
-        assert_eq!(record.replaced.unwrap().name, all[0].name);
+        assert_eq!(record.unwrap().name, all[0].name);
         assert_eq!(contacts.entries().len(), most);
     }
 
@@ -710,10 +694,10 @@ mod tests {
             contacts.record_sender(Instant::now(), name, Incarnation::UNKNOWN, at_host(1))
         };
         assert_eq!(record("another"), Err(ContactError::Full));
-        assert_eq!(record("1 7"), Ok(ContactChange::default()));
+        assert_eq!(record("1 7"), Ok(None));
         assert_eq!(contacts.entries().len(), most);
         contacts.pin(HashSet::new());
-        assert!(record("another").unwrap().replaced.is_some());
+        assert!(record("another").unwrap().is_some());
         assert!(matches!(record(""), Err(ContactError::Entry(_))));
         assert!(matches!(record("a\nb"), Err(ContactError::Entry(_))));
     }

@@ -47,7 +47,7 @@ mod view;
 mod watch;
 
 pub use coalition::{Members, MembersError};
-pub use contacts::{ContactChange, ContactDirectory, ContactError};
+pub use contacts::{ContactDirectory, ContactError};
 pub use directory::{DeregisterError, Directory, RegisterError, Updated};
 pub use entry::{Entry, EntryError, MtsId, Reach, Registration, Role, Source};
 pub use exchange::{

@@ -643,7 +643,7 @@ fn entries_of_a_gateway_without_trust_end_at_once() {
         Incarnation::from_u64(7),
         location(0).with_incarnation(gateway),
     );
-    assert!(recorded.unwrap().is_new);
+    assert_eq!(recorded, Ok(None));
     let directory = world.gateways[1].exchange.directory();
     let all = MergedDirectory::new(vec![
         Arc::clone(&contacts) as _,

@@ -37,6 +37,8 @@ pub(super) struct DirectorySync {
     /// Whether announcements stay on this host.
     pub(super) only_loopback: bool,
     pub(super) pace: Mutex<PublishPace>,
+    /// The generations of `known` and `contacts` that are published. Locked while agents are.
+    pub(super) published: Mutex<Option<[u64; 2]>>,
 }
 
 impl DirectorySync {
@@ -60,14 +62,26 @@ impl DirectorySync {
     /// Publishes the agents of other hosts because a letter is about to be handed to an agent that may reply. In a
     /// flood of such letters, the task does it after its pause.
     pub(super) fn publish_for_letter(&self) {
-        let may_hurry = self.pace.lock().may_hurry(Instant::now());
-        if may_hurry {
-            self.publish();
+        let mut published = self.published.lock();
+        let is_published = *published == Some(self.generations());
+        if !is_published && self.pace.lock().may_hurry(Instant::now()) {
+            self.publish_now(&mut published);
         }
+    }
+
+    /// The generations of the directories with the agents of other hosts.
+    fn generations(&self) -> [u64; 2] {
+        [self.known.generation(), self.contacts.generation()]
     }
 
     /// Publishes all agents of other hosts on this host.
     fn publish(&self) {
+        self.publish_now(&mut self.published.lock());
+    }
+
+    fn publish_now(&self, published: &mut Option<[u64; 2]>) {
+        // Read before the agents, so that a change in between causes another publication.
+        let generations = self.generations();
         let locations = self.service.locations();
         let (contacts, known) = (self.contacts.entries(), self.known.entries());
         let is_proved = |entry: &&Arc<Entry>| {
@@ -91,12 +105,13 @@ impl DirectorySync {
         let through_here: Vec<Arc<Entry>> = through_here.collect();
         let mut lost = self.known.lost_agents();
         lost.extend(self.contacts.lost_agents());
-        let published = self.host.publish_remote(&through_here, &lost);
-        let size = *published.as_ref().unwrap_or(&0);
+        let written = self.host.publish_remote(&through_here, &lost);
+        let size = *written.as_ref().unwrap_or(&0);
         self.pace.lock().wrote(Instant::now(), size);
-        match published {
+        match written {
+            Ok(_) => *published = Some(generations),
             // A gateway that closes publishes nothing.
-            Ok(_) | Err(HostError::Closed) => {}
+            Err(HostError::Closed) => {}
             Err(error) => {
                 log_limit::warn!(error = %ErrorChain(&error), "cannot publish the agents of other hosts on this host");
             }

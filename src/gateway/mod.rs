@@ -29,7 +29,6 @@ use std::fmt;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 #[cfg(feature = "web")]
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
@@ -37,8 +36,8 @@ use fipa_acl::{ErrorChain, escape};
 use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
-    Cancellation, ContactChange, ContactDirectory, ContactError, Directory, Entry, MergedDirectory,
-    RegisterError, Registration, Role as EntryRole, StaticDirectory, reserved_for,
+    Cancellation, ContactDirectory, ContactError, Directory, Entry, MergedDirectory, RegisterError,
+    Registration, Role as EntryRole, StaticDirectory, reserved_for,
 };
 use fipa_transport::{
     Incarnation, Introduction, Location, Signature, TransportErrorKind, log_limit,
@@ -245,6 +244,7 @@ impl Gateway {
             service: Arc::clone(&gateway.service),
             only_loopback: announces_on_loopback_only(config),
             pace: Default::default(),
+            published: Default::default(),
         });
         // From here on, the sender of a letter from another host is published on this host before
         // the letter is delivered.
@@ -752,10 +752,6 @@ struct KnownPeers {
     network: Mutex<Option<Arc<dyn Network>>>,
     /// The platforms that have taken letters.
     takers: Takers,
-    /// Number of new agents in the directory so far.
-    recorded: AtomicU64,
-    /// The number of them that are published. Locked while they are.
-    published: Mutex<u64>,
 }
 
 impl KnownPeers {
@@ -790,7 +786,7 @@ impl KnownPeers {
         &self,
         name: &str,
         agent: Incarnation,
-        record: impl FnOnce(&ContactDirectory) -> Result<ContactChange, ContactError>,
+        record: impl FnOnce(&ContactDirectory) -> Result<Option<Arc<Entry>>, ContactError>,
     ) -> Result<(), ContactError> {
         // An agent of a platform without a gateway, such as JADE, must not pass for one of a gateway.
         if let Some(gateway) = reserved_for(name).filter(|_| !agent.is_known())
@@ -798,11 +794,7 @@ impl KnownPeers {
         {
             return Err(fipa_sds::EntryError::Reserved(gateway.to_owned()).into());
         }
-        let change = record(&self.directory)?;
-        if change.is_new {
-            self.recorded.fetch_add(1, Ordering::AcqRel);
-        }
-        if let Some(replaced) = change.replaced {
+        if let Some(replaced) = record(&self.directory)? {
             let (agent, at) = (escape(&replaced.name), replaced.locations.first());
             let at = at.map(|at| escape(at.address()).into_owned());
             log_limit::info!(
@@ -833,17 +825,10 @@ impl Contacts for KnownPeers {
     }
 
     fn publish(&self) {
-        let wanted = self.recorded.load(Ordering::Acquire);
-        let mut published = self.published.lock();
-        if *published >= wanted {
-            return;
-        }
-        let recorded = self.recorded.load(Ordering::Acquire);
         let publisher = self.publisher.lock().clone();
         if let Some(publisher) = publisher {
             publisher.publish_for_letter();
         }
-        *published = recorded;
     }
 
     fn suspect(&self, location: &Location, fault: TransportErrorKind) {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::{Letter, Message};
-use fipa_sds::Source;
+use fipa_sds::{Reach, Source};
 use fipa_transport::{Hop, Incarnation, LegacySource};
 
 use super::action::Action;
@@ -66,47 +66,61 @@ pub(super) fn contact_limit() -> SenderLimit {
     )
 }
 
+/// The rate at which agents become known by their letters is exceeded.
+#[derive(Debug)]
+pub(super) struct TooManyContacts;
+
 impl Core {
     /// Reports the sender of a letter with this envelope as a contact if it is unknown, or known as a contact at
     /// another location, so that it can be answered. Returns whether it did.
+    ///
+    /// # Errors
+    /// If too many agents have become known by their letters. A gateway announces its agents, so the directory may have
+    /// this one soon.
     pub(super) fn report_contact(
         &mut self,
         now: Instant,
         agent: Incarnation,
         envelope: EnvelopeParts,
         from: &Hop,
-    ) -> bool {
+    ) -> Result<bool, TooManyContacts> {
         let view = &self.table.view;
         if !agent.is_known() {
-            return false;
+            return Ok(false);
         }
         let registered = view.registered(agent);
         if let Some(known) = &registered {
             if known.source != Source::Contact {
-                return false;
+                return Ok(false);
             }
             if known.locations.first() == Some(&from.location) {
                 let name = Arc::clone(&known.name);
                 self.table
                     .actions
                     .push_back(Action::ContactSeenAgain { name });
-                return false;
+                return Ok(false);
             }
         }
         // A letter that was forwarded by the receiver's previous gateway does not come from the
         // sender's location.
         let Some(name) = envelope.sender.filter(|_| envelope.stamps <= 1) else {
-            return false;
+            return Ok(false);
         };
-        let known = registered.or_else(|| view.named(&name));
-        if known.is_some_and(|known| known.source != Source::Contact || *known.name != name) {
-            return false;
+        // The gateway of an agent may register its name again, before its directory says so.
+        let gateway = from.location.incarnation();
+        let is_taken = match registered {
+            Some(known) => *known.name != name,
+            None => view.named(&name).is_some_and(|known| {
+                known.source != Source::Contact && known.reach != Reach::Remote { gateway }
+            }),
+        };
+        if is_taken {
+            return Ok(false);
         }
         let address = from.location.authority().parse::<SocketAddr>();
         let address = address.ok().map(|it| it.ip().to_canonical());
         if !self.contact_limit.take(now, address, &name) {
-            tracing::debug!(at = %from.location, "rate limit of new agents exceeded; this one cannot be answered");
-            return false;
+            return Err(TooManyContacts);
         }
         let location = from.location.clone();
         self.table.actions.push_back(Action::ContactSeen {
@@ -115,7 +129,7 @@ impl Core {
             location,
             host: None,
         });
-        true
+        Ok(true)
     }
 
     /// Reports an agent of a legacy peer as a contact, at the location that it states as its own. Only for an

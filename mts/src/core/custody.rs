@@ -9,6 +9,7 @@ use fipa_transport::{
 };
 use smallvec::smallvec;
 
+use super::contacts::TooManyContacts;
 use super::ids::LaneKey;
 use super::inbox::link_of;
 use super::label::{ArrivalLink, Label};
@@ -25,6 +26,8 @@ const CUSTODY_AFTER: Duration = Duration::from_millis(200);
 /// Time from the registration of an agent until legacy peers have found it by mDNS. Avahi takes 1.2
 /// s to resolve a new agent; a peer that receives a letter earlier cannot answer it.
 const FOUND_AFTER: Duration = Duration::from_millis(1500);
+/// Time after a first letter in which the gateway of its sender usually announces the sender.
+const ANNOUNCED_AFTER: Duration = Duration::from_millis(500);
 /// Time that remains for the delivery of a letter that waits until its sender is found.
 const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
 
@@ -74,6 +77,7 @@ impl Core {
         if self.ending {
             return Reaction::Now(Answer::Busy);
         }
+        let is_first = !self.lane_ids.contains_key(&key);
         let id = self.lane(now, key, &entry.name);
         if let Some(lane) = self.lanes.get_mut(&id)
             && !lane.takes_into_custody(label.sequence, stamped.len(), &self.table)
@@ -84,10 +88,17 @@ impl Core {
         if let Err(why) = self.ask_gate(now, &entry.name, parts.as_ref(), link_of(via, &from)) {
             return Reaction::Now(Answer::failed(FailureReason::Refused, why));
         }
-        let is_contact =
-            from.is_remote() && self.report_contact(now.instant, stream.sender, envelope, &from);
-        if is_contact {
-            self.await_publication(id);
+        let mut announced_by = None;
+        if from.is_remote() {
+            match self.report_contact(now.instant, stream.sender, envelope, &from) {
+                Ok(true) => self.await_publication(id),
+                Ok(false) if is_first && self.is_ahead => self.await_publication(id),
+                Err(TooManyContacts) if is_first => {
+                    let wait = ANNOUNCED_AFTER.min(label.remaining / 2);
+                    announced_by = Some(now.instant + wait);
+                }
+                _ => {}
+            }
         }
         self.table
             .notice(stream, label.sequence, &entry.name, || News::Passed {
@@ -103,6 +114,9 @@ impl Core {
         let mut open_letter = OpenLetter::new(now.instant, origin, stamped, letter_of, deadline);
         open_letter.after = label.after;
         open_letter.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
+        if let Some(until) = announced_by {
+            open_letter.delay_until(until);
+        }
         let sender = (stream.sender, from.is_remote());
         if let Some(until) = self.found_by_peer(now, sender, &entry, label.remaining) {
             open_letter.delay_until(until);

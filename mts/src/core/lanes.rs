@@ -180,8 +180,8 @@ impl Core {
         })
     }
 
-    /// Makes the letters of a lane wait until the contacts were published to the processes of this host, so that
-    /// their receivers can answer.
+    /// Makes the letters of a lane wait until the agents of other hosts were published to the processes of this host, so
+    /// that their receivers can answer.
     pub(super) fn await_publication(&mut self, lane: LaneId) {
         if let Some(lane) = self.lanes.get_mut(&lane) {
             lane.want_refresh(&mut self.table);

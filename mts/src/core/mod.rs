@@ -162,6 +162,8 @@ pub struct Core {
     own_addresses: Vec<SocketAddr>,
     /// Whether letters of others are no longer accepted.
     ending: bool,
+    /// Whether the view may have agents of other hosts that the processes of this host do not see yet.
+    is_ahead: bool,
     /// Whether the service has ended, and so sends nothing.
     closed: bool,
     next_lane: u64,
@@ -206,6 +208,7 @@ impl Core {
             legacy_contact_limit: contacts::contact_limit(),
             own_addresses: Vec::new(),
             ending: false,
+            is_ahead: false,
             closed: false,
             next_lane: 1,
             next_submission: 1,
@@ -274,7 +277,13 @@ impl Core {
     /// Replaces the view of the directory. Call it before other methods when the directory has
     /// changed. Returns the previous view.
     pub fn set_view(&mut self, view: Arc<dyn View>) -> Arc<dyn View> {
+        self.is_ahead = true;
         std::mem::replace(&mut self.table.view, view)
+    }
+
+    /// Records that the processes of this host see all agents of other hosts in the view.
+    pub fn handle_published(&mut self) {
+        self.is_ahead = false;
     }
 
     /// Whether the view has an agent, coalition or gateway of exactly this name.

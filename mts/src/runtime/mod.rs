@@ -87,8 +87,8 @@ pub trait Contacts: Send + Sync {
     /// not block.
     fn took(&self, name: &str, location: &Location);
 
-    /// Publishes the agents of [`contact_seen`](Self::contact_seen) to the processes of this host. Called without the service
-    /// locked, because it may write files.
+    /// Publishes the agents of other hosts, also those of [`contact_seen`](Self::contact_seen), to the processes of this
+    /// host, unless they see them. Called without the service locked, because it may write files.
     fn publish(&self);
 
     /// A service may be gone; see [`Action::Suspect`].
@@ -184,8 +184,8 @@ struct Shared {
 /// Work that actions of the core leave to be done without the lock.
 #[derive(Default)]
 struct Unlocked {
-    /// Whether contacts are to be published before the directory is refreshed.
-    has_new_contacts: bool,
+    /// Generation of the directory whose view the core has.
+    generation: u64,
     /// Number of the last refresh of the directory that the core has requested.
     refresh: Option<u64>,
 }
@@ -749,14 +749,15 @@ impl Shared {
     ) {
         let mut rest = self.perform(guard, release);
         while let Some(number) = rest.refresh {
-            if rest.has_new_contacts
-                && let Some(contacts) = &self.config.contacts
-            {
+            if let Some(contacts) = &self.config.contacts {
                 contacts.publish();
             }
             self.directory.refresh();
             let mut state = self.lock();
             let now = state.clocks.now();
+            if state.generation == rest.generation {
+                state.core.handle_published();
+            }
             state.core.handle_refreshed(now, number);
             rest = self.perform(state, release);
         }
@@ -835,7 +836,6 @@ impl Shared {
                     if let Some(contacts) = &self.config.contacts {
                         contacts.contact_seen(&name, agent, location, host.as_deref());
                         state.update_view(&*self.directory);
-                        rest.has_new_contacts = true;
                     }
                 }
                 Action::ContactSeenAgain { name } => {
@@ -867,6 +867,7 @@ impl Shared {
                 }
             }
         }
+        rest.generation = state.generation;
         let due = state.core.poll_timeout();
         let earlier = due.is_some_and(|due| state.armed.is_none_or(|armed| due < armed));
         let replaced = std::mem::take(&mut state.replaced);
