@@ -1,11 +1,13 @@
 //! The dashboard: a page of the gateway that shows the domain, and `fipa dashboard`, which opens it.
 //!
 //! * [`observation`] observes the domain while pages show it; [`picture`] is the state of the domain.
+//! * [`offers`] follows the agents at which pages look.
 //! * [`orders`] sends messages for clients, if `http.control` permits it.
 //! * [`pages`] answers requests; [`view`] has the rows of a view, and their changes.
 //! * `assets/` is the page: plain JavaScript modules without a build step.
 
 mod observation;
+mod offers;
 mod orders;
 mod pages;
 mod picture;
