@@ -27,7 +27,6 @@ use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 
 use self::meter::{Meter, Observed};
-pub(in crate::command) use self::peers::PeerState;
 use self::peers::Peers;
 pub(in crate::command) use self::print::{agent_object, peer_object, totals_object};
 use self::screen::Palette;

@@ -100,8 +100,8 @@ export function offers(agent) {
     element('td', {}, newest(row, agent))));
   const topicBox = element('div', { class: 'card', hidden: true }, topics.node);
   const images = new Images(agent);
-  const node = element('section', { 'aria-label': 'Offers' }, element('h3', {}, 'Offers'),
-    element('div', { class: 'card' }, services.node, about), topicBox, images.node);
+  const serviceBox = element('div', { class: 'card' }, services.node, about);
+  const node = element('section', { 'aria-label': 'Offers' }, element('h3', {}, 'Offers'), serviceBox, topicBox, images.node);
   const update = (sections) => {
     const offer = sections.offer?.[agent];
     const all = sections.topics ?? {};
@@ -116,6 +116,7 @@ export function offers(agent) {
     if (about.textContent !== text) about.textContent = text;
     about.hidden = text === '';
     about.className = offer?.problem ? 'bad-text' : 'faint';
+    serviceBox.hidden = services.node.hidden && about.hidden;
     topics.rows.show(Object.entries(all).sort(([a], [b]) => (a < b ? -1 : 1)));
     topicBox.hidden = Object.keys(all).length === 0;
     images.show(all);

@@ -36,7 +36,7 @@ const HOSTS = [{ title: 'Host' }, { title: 'Link' }, { title: 'Agents', class: '
 function hostRow({ name, state, agents }) {
   const more = agents.length - MAX_NAMES;
   return element('tr', { class: state === 'lost' ? 'ended' : null },
-    element('td', { class: 'name' }, name), element('td', {}, state),
+    element('td', { class: 'name' }, name), element('td', { class: 'short' }, state),
     element('td', { class: 'number' }, String(agents.length)),
     element('td', { class: 'optional' }, agents.slice(0, MAX_NAMES).join(', '), more > 0 ? ` and ${more} more` : ''));
 }
@@ -93,9 +93,8 @@ function conversationsOf(letters) {
   return [...found];
 }
 
-function totals(point, at) {
-  const shown = [['Time', clock(at * 1000)], ['Agents', point?.agents ?? '–'], ['Hosts', point ? point.hosts + 1 : '–'],
-    ['Letters/s', rate(point?.letters_per_second) || '–'], ['Not delivered/s', rate(point?.failures_per_second) || '–',
+function totals(point, at, agents, hosts) {
+  const shown = [['Time', clock(at * 1000)], ['Agents', agents], ['Hosts', hosts], ['Letters/s', rate(point?.letters_per_second) || '–'], ['Not delivered/s', rate(point?.failures_per_second) || '–',
       point?.failures_per_second > 0], ['Delivery', span(point?.median_us) || '–']];
   return shown.map(([name, value, isBad]) => element('div', {},
     element('dt', {}, name), element('dd', { class: isBad ? 'bad-text' : null }, String(value))));
@@ -152,23 +151,24 @@ export function past(start) {
     slider.value = at;
     const ago = now - at;
     slider.setAttribute('aria-valuetext', ago === 0 ? 'now' : `${clock(at * 1000)}, ${ago} seconds ago`);
-    present.setAttribute('aria-pressed', String(chosen === null));
+    follow.setAttribute('aria-pressed', String(chosen === null));
     rates.mark(at);
-    rates.show(latest.history);
-    // A second may have no point of its own.
-    const point = latest.history[times.findLast((time) => time <= at)];
-    numbers.replaceChildren(...totals(point, at));
-
+    rates.show(Object.fromEntries(Object.entries(latest.history).filter(([time]) => time >= first)));
     const own = latest.domain?.totals?.gateway ?? latest.domain?.totals?.host ?? 'this host';
     const peers = Object.entries(latest.hosts ?? {}).filter(([name]) => name !== own);
     const groups = new Map([[own, { name: own, state: 'this host', agents: [] }]]);
     for (const [name, host] of peers) groups.set(name, { name, state: linkAt(host, now, at), agents: [] });
     const agents = Object.entries(latest.agents ?? {});
-    for (const [name, row] of agents.filter(([, row]) => wasThere(row, at))) {
+    const present = agents.filter(([, row]) => wasThere(row, at));
+    for (const [name, row] of present) {
       const host = row.here ? own : row.host ?? 'another host';
       if (!groups.has(host)) groups.set(host, { name: host, state: 'known without a connection', agents: [] });
       groups.get(host).agents.push(name);
     }
+    const connected = [...groups.values()].filter((row) => ['this host', 'connected'].includes(row.state));
+    // A second may have no point of its own.
+    const point = latest.history[times.findLast((time) => time <= at)];
+    numbers.replaceChildren(...totals(point, at, present.length, connected.length));
     hosts.rows.show([...groups].filter(([, row]) => row.agents.length > 0 || row.state !== 'not connected'));
     const found = events(agents, peers, now, at);
     recent.rows.show(found);
@@ -185,12 +185,12 @@ export function past(start) {
   const step = (seconds) => () => choose(Math.min(Math.max(Number(slider.value) + seconds, Number(slider.min)), Number(slider.max)));
   slider.addEventListener('input', () => choose(Number(slider.value)));
   const button = (text, click, attributes = {}) => element('button', { type: 'button', on: { click }, ...attributes }, text);
-  const present = button('Now', () => choose(null), { 'aria-pressed': 'true' });
+  const follow = button('Now', () => choose(null), { 'aria-pressed': 'true' });
   const node = element('div', {},
     rates.node,
     element('form', { class: 'time', on: { submit: (event) => event.preventDefault() } },
       element('label', { class: 'wide-label' }, 'Time, the last five minutes', slider),
-      button('10 s earlier', step(-10)), button('10 s later', step(10)), present),
+      button('10 s earlier', step(-10)), button('10 s later', step(10)), follow),
     numbers,
     element('div', { class: 'beside' }, element('div', { class: 'card' }, hosts.node),
       element('div', { class: 'card' }, recent.node, quiet)),

@@ -107,7 +107,7 @@ impl Follower {
     }
 
     /// Asks the directory facilitator for the description of the agent and, if it lists topics there, the agent for
-    /// their state. Other agents may not answer.
+    /// their state. Other agents may not answer. The subscriptions of this program do not count.
     async fn ask(&self) -> Answers {
         let description = match self.description().await {
             Ok(description) => description,
@@ -126,7 +126,14 @@ impl Follower {
         let mut problem = None;
         let topics = match has_topics {
             true => match self.agent.topics_of(&self.publisher).await {
-                Ok(topics) => Some(topics),
+                Ok(mut topics) => {
+                    for topic in &mut topics {
+                        let own = topic.first_subscribers.iter();
+                        let own = own.filter(|it| it.name == self.agent.name()).count() as u64;
+                        topic.subscribers = topic.subscribers.saturating_sub(own);
+                    }
+                    Some(topics)
+                }
                 Err(error) => {
                     problem = Some(ErrorChain(&error).to_string());
                     None

@@ -1,11 +1,11 @@
-//! The rates and the numbers of agents and hosts of the last minutes, for a chart.
+//! The rates of the last minutes, for a chart.
 
 use std::collections::VecDeque;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde_json::{Value, json};
 
-use crate::command::top::{PeerState, Snapshot, totals_object};
+use crate::command::top::{Snapshot, totals_object};
 
 /// Number of points, one a second.
 const MAX_POINTS: usize = 600;
@@ -32,15 +32,9 @@ impl History {
         }
         let totals = totals_object(counted);
         let value = |key: &str| totals.get(key).cloned().unwrap_or_default();
-        let surroundings = &counted.header.surroundings;
-        let connected = counted
-            .peers
-            .iter()
-            .filter(|peer| matches!(peer.state, PeerState::Connected(_)));
         let point = json!({
             "letters_per_second": value("letters_per_second"), "failures_per_second": value("failures_per_second"),
-            "median_us": value("median_us"), "agents": surroundings.here + surroundings.elsewhere,
-            "hosts": connected.count(),
+            "median_us": value("median_us"),
         });
         self.points.push_back((second, point));
     }
