@@ -126,7 +126,8 @@ export function past(start) {
       shownAt = at;
       const kept = domain.totals.since;
       since.textContent = !kept ? 'no letters since this page observes the domain'
-        : `The gateway has letters since ${clock(kept)}; the newest 200 before the chosen time are listed.`;
+        : Object.keys(found).length === 0 ? `no letters: the gateway has those since ${clock(kept)}`
+          : `The newest 200 letters of this time. The gateway has those since ${clock(kept)}.`;
       letters.show(found);
       const newest = Object.values(found).sort((a, b) => b.number - a.number);
       const all = conversationsOf(newest);
@@ -159,7 +160,7 @@ export function past(start) {
     const groups = new Map([[own, { name: own, state: 'this host', agents: [] }]]);
     for (const [name, host] of peers) groups.set(name, { name, state: linkAt(host, now, at), agents: [] });
     const agents = Object.entries(latest.agents ?? {});
-    const present = agents.filter(([, row]) => wasThere(row, at));
+    const present = agents.filter(([, row]) => !row.members && wasThere(row, at));
     for (const [name, row] of present) {
       const host = row.here ? own : row.host ?? 'another host';
       if (!groups.has(host)) groups.set(host, { name: host, state: 'known without a connection', agents: [] });
