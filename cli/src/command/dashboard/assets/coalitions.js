@@ -40,6 +40,21 @@ class Coalition {
   }
 }
 
+/** The members of the coalition that a view shows. */
+export function members() {
+  const node = element('p', { hidden: true });
+  let shown = '';
+  const show = (row) => {
+    node.hidden = !row?.members;
+    const text = JSON.stringify([row?.members, row?.leader]);
+    if (text === shown) return;
+    shown = text;
+    node.replaceChildren('Members: ', ...(row?.members ?? []).flatMap((name, index) =>
+      [index === 0 ? '' : ', ', link('agent', name), name === row.leader ? ' (leader)' : '']));
+  };
+  return { node, show };
+}
+
 /** The coalitions, each with its members, the leader first. */
 export function coalitions() {
   const grid = element('div', { class: 'hosts' });

@@ -2,7 +2,7 @@
 
 import { clock, element, link, problems, rate, seconds, span, table } from './elements.js';
 import { chart } from './chart.js';
-import { coalitions } from './coalitions.js';
+import { coalitions, members } from './coalitions.js';
 import { conversationTable } from './conversations.js';
 import { letterTable } from './letters.js';
 import { offers } from './offers.js';
@@ -174,8 +174,9 @@ export function agent(name, topic) {
   const talks = conversationTable();
   const letters = letterTable();
   const offer = offers(name);
+  const group = members();
   const node = element('div', {},
-    element('h2', {}, name), about, form, offer.node,
+    element('h2', {}, name), about, group.node, form, offer.node,
     element('h3', {}, 'Partners'), element('div', { class: 'beside' },
       element('div', { class: 'card' }, partners.node), reasonBox),
     element('h3', {}, 'Conversations'), talks.node, element('h3', {}, 'Letters'), letters.node);
@@ -188,6 +189,7 @@ export function agent(name, topic) {
       : [['State', 'not in the directory', true]];
     about.replaceChildren(...facts.map(([title, value, isBad]) => element('div', {},
       element('dt', {}, title), element('dd', { class: isBad ? 'bad-text' : null }, value))));
+    group.show(row);
     offer.update(sections);
     partners.rows.show(Object.entries(sections.partners ?? {}));
     reasons.rows.show(Object.entries(sections.reasons ?? {}));

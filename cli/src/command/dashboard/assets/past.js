@@ -13,8 +13,9 @@ const RECENT = 60;
 /** Maximum number of names that are listed in a row. */
 const MAX_NAMES = 20;
 
-/** Minimum time between two questions for letters, in milliseconds. */
+/** Minimum times between two questions for letters, in milliseconds: while the slider moves, and while time passes. */
 const PACE = 250;
+const PRESENT_PACE = 2000;
 
 const atOf = (time) => Date.parse(time) / 1000;
 
@@ -115,11 +116,14 @@ export function past(start) {
   const letters = letterTable();
 
   let shownAt = null;
+  let askedAt = -Infinity;
   let isAsking = false;
   /** Asks for the letters of the time, one question after the other. */
   const ask = async (at) => {
-    if (isAsking || at === shownAt) return;
+    const isDue = chosen !== null || performance.now() - askedAt >= PRESENT_PACE;
+    if (isAsking || at === shownAt || !isDue) return;
     isAsking = true;
+    askedAt = performance.now();
     const answer = await fetch(`api/past?at=${at}`).catch(() => null);
     if (answer?.ok) {
       const { letters: found, domain } = await answer.json();
@@ -150,8 +154,8 @@ export function past(start) {
     slider.min = first;
     slider.max = now;
     slider.value = at;
-    const ago = now - at;
-    slider.setAttribute('aria-valuetext', ago === 0 ? 'now' : `${clock(at * 1000)}, ${ago} seconds ago`);
+    const said = chosen === null ? 'now' : clock(at * 1000);
+    if (slider.getAttribute('aria-valuetext') !== said) slider.setAttribute('aria-valuetext', said);
     follow.setAttribute('aria-pressed', String(chosen === null));
     rates.mark(at);
     rates.show(Object.fromEntries(Object.entries(latest.history).filter(([time]) => time >= first)));
