@@ -45,7 +45,7 @@ function hostRow({ name, state, agents }) {
 const EVENTS = [{ title: 'Time' }, { title: 'Event' }];
 
 function eventRow({ at, name, text, isBad, isAgent }) {
-  return element('tr', {}, element('td', {}, clock(at * 1000)),
+  return element('tr', {}, element('td', { class: 'short' }, clock(at * 1000)),
     element('td', { class: isBad ? 'bad-text' : null }, isAgent ? link('agent', name) : name, ` ${text}`));
 }
 
