@@ -257,7 +257,7 @@ fn the_description_of_the_interface_is_what_the_gateway_answers() {
     let shown = Shown::start(&host, "127.0.0.1:0", &[]);
     let (_, _, text) = shown.ask("GET", "/api/openapi.json", "", "");
     let description: Value = serde_json::from_str(&text).unwrap();
-    let _crane = host.ordered_agent("crane", &[]);
+    let _crane = host.start(&["publish", "crane", "charge", "80"]);
     let mut letters = shown.follow("letters");
     let _ = letters.event("snapshot");
     let _owner = host.start(&["own", "bay"]);
@@ -285,9 +285,13 @@ fn the_description_of_the_interface_is_what_the_gateway_answers() {
         let given = match get["parameters"][0]["name"].as_str() {
             Some("name") => "?name=crane",
             Some("id") => "?id=c1",
+            Some("at") => "?at=9999999999",
             _ => "",
         };
-        let schema = &get["responses"]["200"]["content"]["application/json"]["schema"];
+        // Other tests ask for what is no JSON.
+        let Some(schema) = get.pointer("/responses/200/content/application~1json/schema") else {
+            continue;
+        };
         // Each section has a row as soon as the domain has been looked at.
         let mut view = Value::Null;
         until(path, || {

@@ -1,11 +1,13 @@
 //! The dashboard: a page of the gateway that shows the domain, and `fipa dashboard`, which opens it.
 //!
 //! * [`observation`] observes the domain while pages show it; [`picture`] is the state of the domain.
+//! * [`offers`] follows the agents at which pages look.
 //! * [`orders`] sends messages for clients, if `http.control` permits it.
 //! * [`pages`] answers requests; [`view`] has the rows of a view, and their changes.
 //! * `assets/` is the page: plain JavaScript modules without a build step.
 
 mod observation;
+mod offers;
 mod orders;
 mod pages;
 mod picture;
@@ -37,7 +39,8 @@ use crate::report::Failure;
 /// Show the robots of the domain on a web page of the gateway
 ///
 /// Prints the link of the page, and opens it in a browser if this is a desktop. The page shows hosts and agents, the
-/// links between hosts, conversations and their violations, locks, and letters with their ways. It changes nothing.
+/// links between hosts, the topics of agents, conversations and their violations, locks, letters with their ways, and
+/// the last minutes again. It changes nothing.
 ///
 /// The gateway must have the option http.listen. Everyone who has the link sees the domain: it contains the token of
 /// the gateway, which only the user of the gateway can read. If http.listen is an address that other hosts reach, the page

@@ -12,6 +12,7 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, mpsc};
 use tokio::time::{Instant, MissedTickBehavior};
 
+use super::offers::{self, Offers};
 use super::orders::Orders;
 use super::picture::{Picture, Wanted};
 use super::view::View;
@@ -37,6 +38,7 @@ const RETRY: Duration = Duration::from_secs(5);
 
 /// The state of the domain for all pages.
 pub(super) struct Observation {
+    pub(super) offers: Arc<Offers>,
     pub(super) orders: Orders,
     picture: Mutex<Picture>,
     /// Wakes the task that observes.
@@ -52,6 +54,7 @@ impl Observation {
         let now = Instant::now();
         let picture = Picture::new(orders.are_permitted());
         Arc::new(Self {
+            offers: Arc::default(),
             orders,
             picture: Mutex::new(picture),
             wanted: Notify::new(),
@@ -72,7 +75,12 @@ impl Observation {
             *self.last_locks.lock() = Instant::now();
         }
         self.keep();
-        self.picture.lock().view(wanted)
+        let mut view = self.picture.lock().view(wanted);
+        if let Wanted::Agent { name, topic } = wanted {
+            self.offers.look_at(name, topic.as_deref());
+            self.offers.put(name, Arc::make_mut(&mut view));
+        }
+        view
     }
 
     /// Keeps the domain observed.
@@ -164,6 +172,7 @@ async fn follow(
         () = watching => false,
         () = top::ask(asker, sender) => false,
         () = ask_for_locks(observation, &locks_asker, locks_sender) => false,
+        () = offers::serve(&observation.offers, &locks_asker) => false,
         served = observation.orders.serve(domain, config) => {
             served?;
             false

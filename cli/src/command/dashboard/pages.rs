@@ -38,7 +38,7 @@ const PACE: Duration = Duration::from_millis(200);
 const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
 
 /// The parts of the page: path, media type, content.
-const PARTS: [(&str, &str, &str); 15] = [
+const PARTS: [(&str, &str, &str); 18] = [
     (
         "/",
         "text/html; charset=utf-8",
@@ -71,6 +71,13 @@ const PARTS: [(&str, &str, &str); 15] = [
         JAVASCRIPT,
         include_str!("assets/conversations.js"),
     ),
+    ("/offers.js", JAVASCRIPT, include_str!("assets/offers.js")),
+    (
+        "/coalitions.js",
+        JAVASCRIPT,
+        include_str!("assets/coalitions.js"),
+    ),
+    ("/past.js", JAVASCRIPT, include_str!("assets/past.js")),
     ("/locks.js", JAVASCRIPT, include_str!("assets/locks.js")),
     ("/letters.js", JAVASCRIPT, include_str!("assets/letters.js")),
     (
@@ -106,6 +113,7 @@ pub(super) fn pages(observation: Arc<Observation>, library: Arc<Library>) -> Pag
     let protected = Router::new()
         .route("/api/live/{view}", get(live))
         .route("/api/protocol.svg", get(protocol))
+        .route("/api/image", get(image))
         .route("/api/send", post(send))
         .layer(DefaultBodyLimit::max(MAX_ORDER))
         .route("/api/{view}", get(snapshot))
@@ -132,14 +140,23 @@ fn wanted(view: &str, parameters: &mut HashMap<String, String>) -> Result<Wanted
     };
     match view {
         "fleet" => Ok(Wanted::Fleet),
-        "agent" => parameter("name").map(Wanted::Agent),
+        "agent" => parameter("name").map(|name| Wanted::Agent {
+            name,
+            topic: parameter("topic").ok(),
+        }),
         "conversations" => Ok(Wanted::Conversations),
         "conversation" => parameter("id").map(Wanted::Conversation),
         "locks" => Ok(Wanted::Locks),
         "letters" => Ok(Wanted::Letters),
+        "past" => {
+            let wrong = |_| {
+                let why = "the parameter at is not a number of seconds since 1970\n";
+                (StatusCode::BAD_REQUEST, why.to_owned())
+            };
+            parameter("at")?.parse().map(Wanted::Past).map_err(wrong)
+        }
         _ => {
-            let why =
-                "the views are fleet, agent, conversations, conversation, locks and letters\n";
+            let why = "the views are fleet, agent, conversations, conversation, locks, letters and past\n";
             Err((StatusCode::NOT_FOUND, why.to_owned()))
         }
     }
@@ -172,6 +189,21 @@ async fn protocol(
     };
     let svg = drawing::svg(machine, false, parameter("state"));
     ([(CONTENT_TYPE, "image/svg+xml")], svg).into_response()
+}
+
+/// Answers with the newest image of a topic that is followed.
+async fn image(
+    State(shown): State<Shown>,
+    Query(parameters): Query<HashMap<String, String>>,
+) -> Response {
+    let (name, topic) = (parameters.get("name"), parameters.get("topic"));
+    let image = name
+        .zip(topic)
+        .and_then(|(name, topic)| shown.observation.offers.image(name, topic));
+    match image {
+        Some((media_type, content)) => ([(CONTENT_TYPE, media_type)], content).into_response(),
+        None => (StatusCode::NOT_FOUND, "no image of this topic is known\n").into_response(),
+    }
 }
 
 /// Sends a message, and answers with its outcomes.

@@ -10,14 +10,23 @@ export function chart() {
   const words = element('figcaption', {});
   const node = element('figure', { class: 'card chart' }, words, box);
   let plot = null;
+  let marked = null;
   const style = getComputedStyle(document.documentElement);
   const color = (name) => style.getPropertyValue(name).trim();
+  /** Draws a line at the marked time. */
+  const drawMark = ({ ctx, bbox, valToPos }) => {
+    if (marked === null) return;
+    const place = Math.round(valToPos(marked, 'x', true));
+    ctx.fillStyle = color('--ink');
+    ctx.fillRect(place - 1, bbox.top, 2, bbox.height);
+  };
   const begin = (data) => {
     const axis = { stroke: color('--faint'), grid: { stroke: color('--line') }, ticks: { stroke: color('--line') } };
     plot = new globalThis.uPlot({
       width: Math.max(200, box.clientWidth), height: HEIGHT, legend: { show: false }, cursor: { show: false },
       scales: { y: { range: (_, low, high) => [0, Math.max(1, high * 1.1)] } },
       axes: [axis, { ...axis, size: 60 }],
+      hooks: { draw: [drawMark] },
       series: [{}, { stroke: color('--accent'), width: 2, fill: `${color('--accent')}22` },
         { stroke: color('--bad'), width: 2 }],
     }, data, box);
@@ -26,6 +35,10 @@ export function chart() {
   resized.observe(box);
   return {
     node,
+    /** Marks this time, in seconds since 1970, when the points are shown the next time. */
+    mark(time) {
+      marked = time;
+    },
     show(points) {
       const times = Object.keys(points).map(Number).sort((a, b) => a - b);
       if (times.length === 0) return;

@@ -2,8 +2,10 @@
 
 import { clock, element, link, problems, rate, seconds, span, table } from './elements.js';
 import { chart } from './chart.js';
+import { coalitions, members } from './coalitions.js';
 import { conversationTable } from './conversations.js';
 import { letterTable } from './letters.js';
+import { offers } from './offers.js';
 
 const COLUMNS = [
   { title: 'Agent' },
@@ -17,7 +19,7 @@ function agentRow(row) {
   const number = (value, isOptional = false) =>
     element('td', { class: isOptional ? 'number optional' : 'number' }, value);
   const about = row.members
-    ? `coalition of ${row.members.join(', ')}${row.leader ? `, led by ${row.leader}` : ', without a leader'}`
+    ? `coalition of ${row.members.length}${row.leader ? `, led by ${row.leader}` : ', without a leader'}`
     : row.type;
   const name = element('td', { class: 'name' }, link('agent', row.name),
     row.ended ? element('span', {}, ` ended ${clock(row.ended)}`) : null,
@@ -81,6 +83,7 @@ export function fleet() {
   const numbers = element('dl', { class: 'totals' });
   const rates = chart();
   const hosts = element('div', { class: 'hosts' });
+  const groups = coalitions();
   const cards = new Map();
   const update = ({ domain, hosts: peers = {}, agents = {}, history = {} }) => {
     const values = domain?.totals;
@@ -89,14 +92,15 @@ export function fleet() {
     numbers.replaceChildren(...totals(values));
     rates.show(history);
     const own = values.gateway ?? values.host;
-    const groups = new Map([[own, []]]);
-    for (const name of Object.keys(peers).sort()) if (name !== own) groups.set(name, []);
+    groups.show(agents, own);
+    const rowsOf = new Map([[own, []]]);
+    for (const name of Object.keys(peers).sort()) if (name !== own) rowsOf.set(name, []);
     for (const [key, row] of Object.entries(agents)) {
       const host = row.here ? own : row.host ?? 'another host';
-      if (!groups.has(host)) groups.set(host, []);
-      groups.get(host).push([key, row]);
+      if (!rowsOf.has(host)) rowsOf.set(host, []);
+      rowsOf.get(host).push([key, row]);
     }
-    for (const [name, rows] of groups) {
+    for (const [name, rows] of rowsOf) {
       if (!cards.has(name)) {
         const card = new HostCard(name, name === own);
         cards.set(name, card);
@@ -106,13 +110,13 @@ export function fleet() {
       cards.get(name).show(peers[name], rows);
     }
     for (const [name, card] of cards) {
-      if (!groups.has(name)) {
+      if (!rowsOf.has(name)) {
         card.node.remove();
         cards.delete(name);
       }
     }
   };
-  return { node: element('div', {}, numbers, rates.node, hosts), path: 'fleet', update };
+  return { node: element('div', {}, numbers, rates.node, groups.node, hosts), path: 'fleet', update };
 }
 
 const PERFORMATIVES = ['request', 'inform', 'query-ref', 'query-if', 'cancel', 'subscribe', 'cfp', 'accept-proposal',
@@ -159,7 +163,7 @@ function reasonRow(row) {
     element('td', { class: 'number bad-text' }, String(row.failures)));
 }
 
-export function agent(name) {
+export function agent(name, topic) {
   const partners = table('Among the newest letters', [{ title: 'Partner' }, { title: 'Sent to', class: 'number' },
     { title: 'Received from', class: 'number' }, { title: 'Problems' }], partnerRow);
   const reasons = table('Letters of this agent that were not delivered', [{ title: 'Reason' },
@@ -169,8 +173,10 @@ export function agent(name) {
   const about = element('dl', { class: 'totals' });
   const talks = conversationTable();
   const letters = letterTable();
+  const offer = offers(name);
+  const group = members();
   const node = element('div', {},
-    element('h2', {}, name), about, form,
+    element('h2', {}, name), about, group.node, form, offer.node,
     element('h3', {}, 'Partners'), element('div', { class: 'beside' },
       element('div', { class: 'card' }, partners.node), reasonBox),
     element('h3', {}, 'Conversations'), talks.node, element('h3', {}, 'Letters'), letters.node);
@@ -183,11 +189,14 @@ export function agent(name) {
       : [['State', 'not in the directory', true]];
     about.replaceChildren(...facts.map(([title, value, isBad]) => element('div', {},
       element('dt', {}, title), element('dd', { class: isBad ? 'bad-text' : null }, value))));
+    group.show(row);
+    offer.update(sections);
     partners.rows.show(Object.entries(sections.partners ?? {}));
     reasons.rows.show(Object.entries(sections.reasons ?? {}));
     reasonBox.hidden = Object.keys(sections.reasons ?? {}).length === 0;
     talks.show(sections.conversations ?? {});
     letters.show(sections.letters ?? {});
   };
-  return { node, path: `agent?name=${encodeURIComponent(name)}`, update };
+  const choice = topic ? `&topic=${encodeURIComponent(topic)}` : '';
+  return { node, path: `agent?name=${encodeURIComponent(name)}${choice}`, update };
 }

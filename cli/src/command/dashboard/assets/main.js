@@ -6,8 +6,9 @@ import { agent, fleet } from './fleet.js';
 import { conversation, conversations } from './conversations.js';
 import { locks } from './locks.js';
 import { letters } from './letters.js';
+import { past } from './past.js';
 
-const VIEWS = { fleet, agent, conversations, conversation, locks, letters };
+const VIEWS = { fleet, agent, conversations, conversation, locks, letters, past };
 /** The place in the menu of views that are not in it. */
 const PLACES = { agent: 'fleet', conversation: 'conversations' };
 
@@ -49,7 +50,7 @@ function askForToken(problem = '') {
 
 /** Shows the view of the address. */
 function show() {
-  const [, view = 'fleet', parameter] = location.hash.split('/');
+  const [, view = 'fleet', parameter, choice] = location.hash.split('/');
   const make = VIEWS[view];
   if (!make) {
     location.replace('#/fleet');
@@ -61,7 +62,7 @@ function show() {
     else item.removeAttribute('aria-current');
   }
   const name = parameter === undefined ? '' : decodeURIComponent(parameter);
-  const { node, path, update } = make(name);
+  const { node, path, update } = make(name, choice === undefined ? null : decodeURIComponent(choice));
   live?.close();
   content.replaceChildren(node);
   document.title = name ? `${name} · fipa` : `fipa · ${view}`;

@@ -70,6 +70,16 @@ impl Letter {
         self.fate.get("reason").and_then(Value::as_str)
     }
 
+    /// Its time as RFC 3339.
+    pub(super) fn time(&self) -> &str {
+        &self.at
+    }
+
+    /// Whether it was sent before this time in RFC 3339, of which all have the same form.
+    pub(super) fn is_before(&self, time: &str) -> bool {
+        *self.at < *time
+    }
+
     /// The row of the letter.
     pub(super) fn row(&self) -> Value {
         json!({

@@ -9,7 +9,7 @@ mod letters;
 mod partners;
 
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use fipa::Entry;
 use fipa::admin::watch::{Event, Passage};
@@ -58,7 +58,11 @@ pub(super) enum Wanted {
     /// Hosts, agents and coalitions.
     Fleet,
     /// An agent, its conversations and its letters.
-    Agent(String),
+    Agent {
+        name: String,
+        /// The topic whose values are wanted, beside the first ones.
+        topic: Option<String>,
+    },
     /// The conversations with the newest letters, and those with violations.
     Conversations,
     /// A conversation with its letters.
@@ -67,6 +71,8 @@ pub(super) enum Wanted {
     Locks,
     /// The newest letters.
     Letters,
+    /// The newest letters of this time, in seconds since 1970.
+    Past(u64),
 }
 
 impl Picture {
@@ -139,11 +145,12 @@ impl Picture {
         }
         match wanted {
             Wanted::Fleet => return Arc::clone(&self.fleet),
-            Wanted::Agent(name) => self.agent(name),
+            Wanted::Agent { name, .. } => self.agent(name),
             Wanted::Conversations => self.all_conversations(),
             Wanted::Conversation(id) => self.conversation(id),
             Wanted::Locks => self.all_locks(),
             Wanted::Letters => self.newest_letters(|_| true),
+            Wanted::Past(second) => self.past(*second),
         }
         .into()
     }
@@ -209,6 +216,16 @@ impl Picture {
         view
     }
 
+    /// The letters at the end of a second.
+    fn past(&self, second: u64) -> View {
+        let end = UNIX_EPOCH.checked_add(Duration::from_secs(second.saturating_add(1)));
+        let end = end.map(moment).unwrap_or_default();
+        let mut view = self.newest_letters(|letter| letter.is_before(&end));
+        let since = self.letters.newest().last().map(Letter::time);
+        view.put("domain", "totals", &json!({ "since": since }));
+        view
+    }
+
     fn newest_letters(&self, shown: impl Fn(&Letter) -> bool) -> View {
         let mut view = View::default();
         view.section("letters");
@@ -229,6 +246,6 @@ pub(super) fn clipped(text: &str) -> String {
 }
 
 /// A time as RFC 3339; empty if it has no such form.
-fn moment(time: SystemTime) -> String {
+pub(super) fn moment(time: SystemTime) -> String {
     output::rfc3339(time).unwrap_or_default()
 }
