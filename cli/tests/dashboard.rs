@@ -5,6 +5,8 @@
 #[path = "common/browser.rs"]
 mod browser;
 mod common;
+#[path = "dashboard/actions.rs"]
+mod actions;
 #[path = "common/listener.rs"]
 mod listener;
 
@@ -278,6 +280,8 @@ fn the_description_of_the_interface_is_what_the_gateway_answers() {
         head.contains("image/svg+xml") && svg.contains("agreed"),
         "{svg}"
     );
+    let _robot = actions::Robot::start(&host, "crex", &[]);
+    let _driving = actions::drive(&host, "crex");
     for (path, description_of_path) in description["paths"].as_object().unwrap() {
         let Some(get) = description_of_path.get("get") else {
             continue;
@@ -293,8 +297,9 @@ fn the_description_of_the_interface_is_what_the_gateway_answers() {
         until(path, || {
             view = answer(&format!("{path}{given}"));
             let sections = schema["properties"].as_object().unwrap();
-            // There is no other host, and all letters are delivered.
-            let may_be_empty = |section: &str| matches!(section, "hosts" | "reasons");
+            // There is no other host, all letters are delivered, and nothing is cancelled.
+            let may_be_empty =
+                |section: &str| matches!(section, "hosts" | "reasons" | "cancelled");
             let has_rows = |section: &str| {
                 may_be_empty(section) || view[section].as_object().is_some_and(|it| !it.is_empty())
             };
@@ -369,6 +374,7 @@ fn the_command_prints_the_link() {
     assert_eq!(host.run(&["dashboard"]).done(), format!("{link}\n"));
     let found = host.run(&["dashboard", "--json"]).done_json();
     assert_eq!(found["link"], link.as_str());
+    assert_eq!(found["fingerprint"], Value::Null);
 }
 
 /// The rows that the page shows, as lines of text.
@@ -544,9 +550,9 @@ fn locks_have_their_holders_and_lost_hosts_stay_in_sight() {
 fn other_hosts_reach_the_page_with_the_key_of_the_gateway_only() {
     let host = Host::new();
     let keys = host.path("keys");
-    let keys = keys.to_str().unwrap();
-    host.run(&["keys", "init", "--dir", keys]).done();
-    let keys = format!("security.keys={keys}");
+    let keys_dir = keys.to_str().unwrap();
+    host.run(&["keys", "init", "--dir", keys_dir]).done();
+    let keys = format!("security.keys={keys_dir}");
     for listen in ["0.0.0.0:0", "[::]:0"] {
         let shown = Shown::start(&host, listen, &[&keys]);
         // Without TLS, there is no answer.
@@ -559,7 +565,17 @@ fn other_hosts_reach_the_page_with_the_key_of_the_gateway_only() {
         let link = host
             .run(&["dashboard", "--set", &keys, "--json"])
             .done_json();
+        let own = host
+            .run(&["keys", "list", "--dir", keys_dir, "--json"])
+            .done_json();
+        let fingerprint = own["own"]["fingerprint"].as_str().unwrap();
+        assert_eq!(link["fingerprint"], fingerprint);
+        assert_eq!(presented(shown.address), fingerprint);
+        let text = host.run(&["dashboard", "--set", &keys]).done();
         let link = link["link"].as_str().unwrap();
+        let expected =
+            format!("{link}\nfingerprint of the certificate (SHA-256): {fingerprint}\n");
+        assert_eq!(text, expected);
         assert!(link.starts_with("https://"), "{link}");
         let name = "other_hosts_reach_the_page_with_the_key_of_the_gateway_only";
         let Some(browser) = Browser::open(name, 1280, 800) else {
@@ -670,6 +686,15 @@ fn clients_send_messages_only_with_control_and_as_an_agent_of_the_host() {
     assert_no_messages(&browser);
 }
 
+/// The configuration of a process of this host.
+fn config_of(host: &Host) -> fipa::Config {
+    let mut config = fipa::Config::for_host("test");
+    config.domain.clone_from(&host.domain);
+    config.runtime_dir = host.path("run").to_str().unwrap().to_owned();
+    config.discovery.mdns = false;
+    config
+}
+
 /// Time of the soak, in minutes.
 const SOAK: u64 = 10;
 
@@ -703,10 +728,7 @@ fn soak() {
     let host = Host::new();
     let shown = Shown::start(&host, "127.0.0.1:0", &[]);
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let mut config = fipa::Config::for_host("soak");
-    config.domain.clone_from(&host.domain);
-    config.runtime_dir = host.path("run").to_str().unwrap().to_owned();
-    config.discovery.mdns = false;
+    let config = config_of(&host);
     let domain = runtime.block_on(fipa::Domain::open(&config)).unwrap();
     let mut agents = Vec::new();
     for number in 0..AGENTS {

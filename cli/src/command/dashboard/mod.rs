@@ -1,10 +1,12 @@
 //! The dashboard: a page of the gateway that shows the domain, and `fipa dashboard`, which opens it.
 //!
 //! * [`observation`] observes the domain while pages show it; [`picture`] is the state of the domain.
-//! * [`orders`] sends messages for clients, if `http.control` permits it.
+//! * [`goals`] asks agents for the goals that they run.
+//! * [`orders`] sends messages and cancels goals for clients, if `http.control` permits it.
 //! * [`pages`] answers requests; [`view`] has the rows of a view, and their changes.
 //! * `assets/` is the page: plain JavaScript modules without a build step.
 
+mod goals;
 mod observation;
 mod orders;
 mod pages;
@@ -37,11 +39,13 @@ use crate::report::Failure;
 /// Show the robots of the domain on a web page of the gateway
 ///
 /// Prints the link of the page, and opens it in a browser if this is a desktop. The page shows hosts and agents, the
-/// links between hosts, conversations and their violations, locks, and letters with their ways. It changes nothing.
+/// links between hosts, conversations and their violations, locks, running actions, and letters with their ways. It changes
+/// nothing, unless http.control is true.
 ///
 /// The gateway must have the option http.listen. Everyone who has the link sees the domain: it contains the token of
 /// the gateway, which only the user of the gateway can read. If http.listen is an address that other hosts reach, the page
-/// is encrypted with the key of the gateway, and the browser asks once whether it may trust this key.
+/// is encrypted with the key of the gateway, and the browser asks once whether it may trust this key. The command prints
+/// the SHA-256 fingerprint of the certificate, to compare it with the one that the browser shows.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -52,7 +56,7 @@ Examples:
                                                     for a tablet in the same network
 
 JSON:
-  { \"domain\": text, \"address\": text, \"link\": text }")]
+  { \"domain\": text, \"address\": text, \"link\": text, \"fingerprint\": text or null without encryption }")]
 pub(crate) struct Arguments {
     /// Print the link only
     #[arg(long)]
@@ -98,9 +102,15 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let link = format!("{}/#token={token}", listener.url);
     if arguments.json {
         let address = listener.address.to_string();
-        return output::json(&json!({ "domain": config.domain, "address": address, "link": link }));
+        return output::json(&json!({
+            "domain": config.domain, "address": address, "link": link, "fingerprint": listener.fingerprint,
+        }));
     }
     output::text(&format!("{link}\n"))?;
+    if let Some(fingerprint) = &listener.fingerprint {
+        let fingerprint = escape(fingerprint);
+        output::text(&format!("fingerprint of the certificate (SHA-256): {fingerprint}\n"))?;
+    }
     let is_desktop = ["DISPLAY", "WAYLAND_DISPLAY"]
         .iter()
         .any(|name| std::env::var_os(name).is_some());

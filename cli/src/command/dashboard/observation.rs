@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa::admin::watch::{WatchOptions, Watcher};
+use fipa::admin::watch::{Event, WatchOptions, Watcher};
 use fipa::error::ErrorChain;
 use fipa::locks::ResourceStatus;
 use fipa::monitor::Library;
@@ -12,7 +12,8 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, mpsc};
 use tokio::time::{Instant, MissedTickBehavior};
 
-use super::orders::Orders;
+use super::goals::{self, Robots, RunningGoal};
+use super::orders::{Cancelled, Orders};
 use super::picture::{Picture, Wanted};
 use super::view::View;
 use crate::command::top::{self, Observer};
@@ -75,6 +76,21 @@ impl Observation {
         self.picture.lock().view(wanted)
     }
 
+    /// Whether a page shows locks and goals.
+    pub(super) fn shows_locks(&self) -> bool {
+        self.last_locks.lock().elapsed() <= 2 * LOCKS_INTERVAL
+    }
+
+    /// Shows the goals that run.
+    pub(super) fn show_goals(&self, goals: &[RunningGoal]) {
+        self.picture.lock().goals.take(goals);
+    }
+
+    /// Shows a goal that a client of the page has cancelled.
+    pub(super) fn show_cancelled(&self, cancelled: &Cancelled) {
+        self.picture.lock().goals.add_cancelled(cancelled);
+    }
+
     /// Keeps the domain observed.
     pub(super) fn keep(&self) {
         *self.last.lock() = Instant::now();
@@ -131,7 +147,8 @@ async fn follow(
     checker: Checker,
 ) -> Result<bool, Failure> {
     let asker = membership::asker(domain).await?;
-    let locks_asker = register(domain, config).await?;
+    let locks_asker = Arc::new(register(domain, config).await?);
+    let robots = Robots::default();
     let own = vec![asker.name().to_owned(), locks_asker.name().to_owned()];
     let watcher = Watcher::open(config, WatchOptions::default()).await;
     let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
@@ -145,6 +162,9 @@ async fn follow(
             tokio::select! {
                 event = watcher.next() => {
                     let checked = observer.event(&event, &watcher);
+                    if let (Event::Letter(passage), Some(_)) = (&event, &checked) {
+                        robots.notice(passage);
+                    }
                     observation.picture.lock().handle(&event, checked.as_ref());
                 }
                 Some(report) = reports.recv() => observer.report(report),
@@ -164,6 +184,7 @@ async fn follow(
         () = watching => false,
         () = top::ask(asker, sender) => false,
         () = ask_for_locks(observation, &locks_asker, locks_sender) => false,
+        () = goals::ask(observation, &robots, &locks_asker) => false,
         served = observation.orders.serve(domain, config) => {
             served?;
             false
@@ -190,7 +211,7 @@ async fn ask_for_locks(
 ) {
     loop {
         tokio::time::sleep(LOCKS_INTERVAL).await;
-        if observation.last_locks.lock().elapsed() > 2 * LOCKS_INTERVAL {
+        if !observation.shows_locks() {
             continue;
         }
         match agent.query_locks(LOCKS_INTERVAL).await {

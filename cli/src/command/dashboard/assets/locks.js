@@ -1,6 +1,7 @@
-// The resources that agents lock.
+// The resources that agents lock, and the goals that they run.
 
 import { element, link, span, table } from './elements.js';
+import { goalTables } from './goals.js';
 
 const COLUMNS = [
   { title: 'Resource' }, { title: 'Holder' }, { title: 'Lease', class: 'number' }, { title: 'Waiting' },
@@ -23,11 +24,16 @@ function lockRow(row) {
 export function locks() {
   const { node, rows } = table('Resources with their holders, asked every two seconds', COLUMNS, lockRow);
   const none = element('p', { class: 'faint' }, 'no resource is owned in this domain');
+  const goals = goalTables();
   const update = (sections) => {
+    goals.update(sections);
     const all = Object.entries(sections.locks ?? {}).sort(([a], [b]) => (a < b ? -1 : 1));
     rows.show(all);
     node.hidden = all.length === 0;
     none.hidden = all.length > 0;
   };
-  return { node: element('div', { class: 'card' }, node, none), path: 'locks', update };
+  const page = element('div', {},
+    element('h2', {}, 'Locks'), element('div', { class: 'card' }, node, none),
+    element('h2', {}, 'Actions'), goals.node);
+  return { node: page, path: 'locks', update };
 }
