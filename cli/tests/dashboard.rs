@@ -2,24 +2,30 @@
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
+#[path = "dashboard/actions.rs"]
+mod actions;
 #[path = "common/browser.rs"]
 mod browser;
 mod common;
-#[path = "dashboard/actions.rs"]
-mod actions;
+#[path = "dashboard/dock.rs"]
+mod dock;
+#[path = "dashboard/hostile.rs"]
+mod hostile;
 #[path = "common/listener.rs"]
 mod listener;
+#[path = "dashboard/memory.rs"]
+mod memory;
 
 use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
-use std::net::TcpStream;
+use std::net::{SocketAddr, TcpStream};
 use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
 
 use browser::Browser;
 use common::Host;
-use fipa_testbed::{ChildGuard, until};
+use fipa_testbed::{AnyPeer, ChildGuard, until};
 use listener::Shown;
 use serde_json::Value;
 
@@ -298,8 +304,7 @@ fn the_description_of_the_interface_is_what_the_gateway_answers() {
             view = answer(&format!("{path}{given}"));
             let sections = schema["properties"].as_object().unwrap();
             // There is no other host, all letters are delivered, and nothing is cancelled.
-            let may_be_empty =
-                |section: &str| matches!(section, "hosts" | "reasons" | "cancelled");
+            let may_be_empty = |section: &str| matches!(section, "hosts" | "reasons" | "cancelled");
             let has_rows = |section: &str| {
                 may_be_empty(section) || view[section].as_object().is_some_and(|it| !it.is_empty())
             };
@@ -546,6 +551,28 @@ fn locks_have_their_holders_and_lost_hosts_stay_in_sight() {
     assert_no_messages(&browser);
 }
 
+/// The SHA-256 of the certificate that a listener presents.
+fn presented(address: SocketAddr) -> String {
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let config = rustls::ClientConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .unwrap()
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(AnyPeer))
+        .with_no_client_auth();
+    let name = "localhost".try_into().unwrap();
+    let mut connection = rustls::ClientConnection::new(Arc::new(config), name).unwrap();
+    let mut stream = TcpStream::connect(("localhost", address.port())).unwrap();
+    connection.complete_io(&mut stream).unwrap();
+    let certificate = &connection.peer_certificates().unwrap()[0];
+    let digest = ring::digest::digest(&ring::digest::SHA256, certificate);
+    digest
+        .as_ref()
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
+}
+
 #[test]
 fn other_hosts_reach_the_page_with_the_key_of_the_gateway_only() {
     let host = Host::new();
@@ -570,11 +597,10 @@ fn other_hosts_reach_the_page_with_the_key_of_the_gateway_only() {
             .done_json();
         let fingerprint = own["own"]["fingerprint"].as_str().unwrap();
         assert_eq!(link["fingerprint"], fingerprint);
-        assert_eq!(presented(shown.address), fingerprint);
         let text = host.run(&["dashboard", "--set", &keys]).done();
+        assert_eq!(presented(shown.address), fingerprint);
         let link = link["link"].as_str().unwrap();
-        let expected =
-            format!("{link}\nfingerprint of the certificate (SHA-256): {fingerprint}\n");
+        let expected = format!("{link}\nfingerprint of the certificate (SHA-256): {fingerprint}\n");
         assert_eq!(text, expected);
         assert!(link.starts_with("https://"), "{link}");
         let name = "other_hosts_reach_the_page_with_the_key_of_the_gateway_only";

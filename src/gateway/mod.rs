@@ -358,7 +358,9 @@ impl Gateway {
             "http"
         };
         #[cfg(feature = "secure")]
-        let security = encryption.as_ref().map(|Encryption(security)| security.clone());
+        let security = encryption
+            .as_ref()
+            .map(|Encryption(security)| security.clone());
         let listener = Listener::open(&http.listen, &http.names, token, encryption)?;
         let address = listener.address();
         // Set only here.

@@ -40,7 +40,9 @@ impl Robot {
 /// Lets a robot drive for the agent `rover`. Returns when the robot has accepted.
 pub(crate) fn drive(host: &Host, robot: &str) -> Running {
     let agent = format!("rover-of-{robot}");
-    let driving = host.start(&["do", robot, "drive", "--json", "--agent", &agent, "--id", "g-1"]);
+    let driving = host.start(&[
+        "do", robot, "drive", "--json", "--agent", &agent, "--id", "g-1",
+    ]);
     assert!(driving.ready.contains("accepted"), "{}", driving.ready);
     driving
 }
@@ -67,7 +69,7 @@ fn a_running_action_is_seen_and_cancelled_from_the_page() {
     // One lets the page cancel its goals, the other does not.
     let _crex = Robot::start(&host, "crex", &["dashboard@base"]);
     let _arm = Robot::start(&host, "arm", &["boss"]);
-    let driving = drive(&host, "crex");
+    let mut driving = drive(&host, "crex");
     let mut other = drive(&host, "arm");
     let name = "a_running_action_is_seen_and_cancelled_from_the_page";
     let browser = shown.open(name, 390, 844);
@@ -117,7 +119,7 @@ fn a_running_action_is_seen_and_cancelled_from_the_page() {
             assert_eq!(answer.0, 200, "{answer:?}");
         }
     }
-    let (code, log) = driving.ended();
+    let (code, log) = driving.end();
     assert_eq!(code, Some(1), "{log}");
     assert!(
         log.contains("cancelled by the operator dashboard@base"),
@@ -125,7 +127,7 @@ fn a_running_action_is_seen_and_cancelled_from_the_page() {
     );
     until("the end of the goal", || goal(&shown, "crex").is_null());
     assert_eq!(goal(&shown, "arm")["state"], "executing");
-    assert!(other.is_running());
+    assert!(!other.has_ended());
 }
 
 #[test]
@@ -146,8 +148,11 @@ fn a_page_without_control_shows_actions_and_cancels_none() {
     };
     browser.value("location.hash = '#/locks'");
     browser.wait_for("25 %");
-    assert_eq!(browser.value("document.querySelectorAll('button').length"), 0);
+    assert_eq!(
+        browser.value("document.querySelectorAll('button').length"),
+        0
+    );
     assert_eq!(goal(&shown, "crex")["state"], "executing");
-    assert!(driving.is_running());
+    assert!(!driving.has_ended());
     assert_no_messages(&browser);
 }

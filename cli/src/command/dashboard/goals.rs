@@ -205,12 +205,17 @@ impl Robots {
             let robots = self.0.lock();
             let unjudged = robots.iter().filter_map(|(name, robot)| {
                 let first = key(&robot.goals.first()?.1);
-                let is_judged = robot.judged.as_ref().is_some_and(|(goal, _)| *goal == first);
+                let is_judged = robot
+                    .judged
+                    .as_ref()
+                    .is_some_and(|(goal, _)| *goal == first);
                 (robot.is_answered && !is_judged).then(|| (name.clone(), first))
             });
             unjudged.collect()
         };
-        let ids = unjudged.keys().filter_map(|name| AgentId::new(&**name).ok());
+        let ids = unjudged
+            .keys()
+            .filter_map(|name| AgentId::new(&**name).ok());
         let answers = ask_all(ids, |robot| {
             let agent = Arc::clone(agent);
             let goal = unjudged.get(robot.name()).cloned().unwrap_or_default();

@@ -22,6 +22,7 @@ use std::sync::Arc;
 
 use clap::Args;
 use fipa::Config;
+use fipa::admin::routes::HttpListener;
 use fipa::web::Pages;
 use fipa_acl::escape;
 use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
@@ -90,16 +91,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             "set http.listen = \"127.0.0.1:9790\" in its configuration, and restart it",
         ));
     };
-    let token = fs::read_to_string(&listener.token_file).map_err(|error| {
-        Failure::failed(
-            format!("cannot read the token of the gateway: {error}"),
-            escape(&listener.token_file).into_owned(),
-            "run the command as the user of the gateway",
-        )
-    })?;
-    // A token of the user's own may have characters that end a link or the attribute of a page.
-    let token = utf8_percent_encode(token.trim_end(), NON_ALPHANUMERIC);
-    let link = format!("{}/#token={token}", listener.url);
+    let link = link(&listener)?;
     if arguments.json {
         let address = listener.address.to_string();
         return output::json(&json!({
@@ -109,7 +101,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     output::text(&format!("{link}\n"))?;
     if let Some(fingerprint) = &listener.fingerprint {
         let fingerprint = escape(fingerprint);
-        output::text(&format!("fingerprint of the certificate (SHA-256): {fingerprint}\n"))?;
+        output::text(&format!(
+            "fingerprint of the certificate (SHA-256): {fingerprint}\n"
+        ))?;
     }
     let is_desktop = ["DISPLAY", "WAYLAND_DISPLAY"]
         .iter()
@@ -118,6 +112,20 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         open_browser(&config, &link)?;
     }
     Ok(())
+}
+
+/// Returns the link of the page, with the token of the gateway.
+pub(super) fn link(listener: &HttpListener) -> Result<String, Failure> {
+    let token = fs::read_to_string(&listener.token_file).map_err(|error| {
+        Failure::failed(
+            format!("cannot read the token of the gateway: {error}"),
+            escape(&listener.token_file).into_owned(),
+            "run the command as the user of the gateway",
+        )
+    })?;
+    // A token of the user's own may have characters that end a link or the attribute of a page.
+    let token = utf8_percent_encode(token.trim_end(), NON_ALPHANUMERIC);
+    Ok(format!("{}/#token={token}", listener.url))
 }
 
 /// Opens the link in a browser. The link goes through a file that only this user can read: all users see the
