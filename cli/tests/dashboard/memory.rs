@@ -7,10 +7,14 @@ use super::*;
 /// Number of letters that fill the tables of the gateway: it shows the newest 5,000.
 const LETTERS: usize = 6000;
 
-/// Bound of the growth of the gateway's own memory with all silent pages. Measured: see the book of the test.
-const MAX_MEMORY: usize = 48 << 20;
+/// Bound of the growth of the gateway's own memory with all silent pages, in bytes. Measured: 5 to 19 MB, most of it the
+/// drift of the allocator.
+const MAX_MEMORY: usize = 64 << 20;
 
-/// Bound of the data that the system keeps for a silent page.
+/// Growth of the gateway with that many letters once its tables are full, in bytes.
+const MAX_DRIFT: usize = 4 << 20;
+
+/// Bound of the data that the system keeps for a silent page, in bytes. Measured: 286 KB.
 const MAX_KEPT: usize = 512 << 10;
 
 /// The memory of a process that is in no file, in bytes.
@@ -68,8 +72,13 @@ fn pages_that_never_read_cost_bounded_memory() {
         send(10);
         newest() >= 200
     });
-    send(LETTERS);
-    let before = memory(&shown.gateway.pid());
+    let pid = shown.gateway.pid();
+    let mut before = 0;
+    until("the gateway does not grow any more", || {
+        send(LETTERS);
+        let earlier = std::mem::replace(&mut before, memory(&pid));
+        before < earlier + MAX_DRIFT
+    });
 
     let silent: Vec<Following> = (0..MAX_STREAMS).map(|_| shown.follow("letters")).collect();
     assert!(silent.iter().all(|it| it.status.contains(" 200 ")));
@@ -77,17 +86,15 @@ fn pages_that_never_read_cost_bounded_memory() {
     let mut all = Vec::new();
     // Until the gateway cannot send more: what the clients have not taken stays the same.
     until("all connections are full", || {
-        send(500);
+        send(1000);
         let found = kept_by_system(port);
         let is_full = found.len() == MAX_STREAMS && found == all && !all.contains(&0);
         all = found;
         is_full
     });
     send(LETTERS);
-    let (grown, most) = (
-        memory(&shown.gateway.pid()).saturating_sub(before),
-        all.iter().max().copied().unwrap(),
-    );
+    let grown = memory(&pid).saturating_sub(before);
+    let most = all.iter().max().copied().unwrap();
     println!(
         "{MAX_STREAMS} silent pages: {grown} bytes of the gateway, up to {most} of the system each"
     );
