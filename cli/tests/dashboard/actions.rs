@@ -103,7 +103,7 @@ fn a_running_action_is_seen_and_cancelled_from_the_page() {
         Some(browser) => {
             let buttons = "document.querySelectorAll('td button').length";
             until("one button", || browser.value(buttons) == 1);
-            browser.wait_for("this page is no operator of the robot");
+            browser.wait_for("not permitted by arm");
             browser.value("document.querySelector('td button').click()");
             browser.wait_for("drive of crex: cancelled by the operator dashboard@base");
             // All pages see it, and by which agent.

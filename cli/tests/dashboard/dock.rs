@@ -34,6 +34,12 @@ fn the_docking_demo_is_followed_live() {
         let is_held = |row: &String| row.starts_with("payload_") && row.contains(" sherpa ");
         rows(&browser).iter().any(is_held)
     });
+    // The owner of this one is on the other host.
+    until("the master holds an interface of crex", || {
+        let is_held = |row: &String| row.starts_with("crex/") && row.contains(" sherpa ");
+        rows(&browser).iter().any(is_held)
+    });
+    browser.wait_for("for operator");
     browser.value("location.hash = '#/conversations'");
     until("a docking", || {
         let all = rows(&browser);

@@ -3,8 +3,7 @@
 import { clock, element, link, table } from './elements.js';
 
 const COLUMNS = [
-  { title: 'Action' }, { title: 'Robot' }, { title: 'Progress' }, { title: 'For' }, { title: 'Since', class: 'optional' },
-  { title: '' },
+  { title: 'Action' }, { title: 'Robot' }, { title: 'Progress' }, { title: 'Since', class: 'optional' }, { title: '' },
 ];
 const CANCELLED_COLUMNS = [
   { title: 'Time' }, { title: 'Action' }, { title: 'Robot' }, { title: 'For', class: 'optional' }, { title: 'By' },
@@ -52,11 +51,13 @@ export function goalTables() {
     const button = element('button', { type: 'button', 'data-key': key, disabled: pending.has(key) }, 'Cancel');
     button.addEventListener('click', () => cancel(row, key, button));
     const act = row.may_cancel ? button
-      : row.may_cancel === false ? element('span', { class: 'faint' }, 'this page is no operator of the robot') : null;
+      : row.may_cancel === false ? element('span', { class: 'faint' }, `not permitted by ${row.robot}`) : null;
     return element('tr', { class: row.answered ? null : 'bad' },
-      element('td', { class: 'name' }, row.action, element('div', { class: 'faint optional' }, row.goal)),
+      element('td', { class: 'name' }, row.action,
+        element('div', { class: 'faint' }, 'for ', link('agent', row.client)),
+        element('div', { class: 'faint optional' }, row.goal)),
       element('td', {}, link('agent', row.robot)), element('td', {}, progress(row)),
-      element('td', {}, link('agent', row.client)), element('td', { class: 'optional' }, clock(row.since)),
+      element('td', { class: 'optional' }, clock(row.since)),
       element('td', {}, act));
   };
   const running = table('Running goals, asked every second', COLUMNS, goalRow);
@@ -75,6 +76,6 @@ export function goalTables() {
     cancelled.rows.show(ended.sort(([a], [b]) => Number(b) - Number(a)));
     cancelledBox.hidden = ended.length === 0;
   };
-  const node = element('div', {}, element('div', { class: 'card' }, running.node, none, result), cancelledBox);
+  const node = element('div', { class: 'stack' }, element('div', { class: 'card' }, running.node, none, result), cancelledBox);
   return { node, update };
 }
