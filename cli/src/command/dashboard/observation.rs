@@ -45,20 +45,19 @@ pub(super) struct Observation {
     /// Ends the task that observes.
     stopped: Notify,
     last: Mutex<Instant>,
-    last_locks: Mutex<Instant>,
+    last_locks: Mutex<Option<Instant>>,
 }
 
 impl Observation {
     pub(super) fn new(orders: Orders) -> Arc<Self> {
-        let now = Instant::now();
         let picture = Picture::new(orders.are_permitted());
         Arc::new(Self {
             orders,
             picture: Mutex::new(picture),
             wanted: Notify::new(),
             stopped: Notify::new(),
-            last: Mutex::new(now),
-            last_locks: Mutex::new(now),
+            last: Mutex::new(Instant::now()),
+            last_locks: Mutex::default(),
         })
     }
 
@@ -70,7 +69,7 @@ impl Observation {
     /// Returns a view, and keeps the domain observed.
     pub(super) fn view(&self, wanted: &Wanted) -> Arc<View> {
         if *wanted == Wanted::Locks {
-            *self.last_locks.lock() = Instant::now();
+            *self.last_locks.lock() = Some(Instant::now());
         }
         self.keep();
         self.picture.lock().view(wanted)
@@ -78,7 +77,8 @@ impl Observation {
 
     /// Whether a page shows locks and goals.
     pub(super) fn shows_locks(&self) -> bool {
-        self.last_locks.lock().elapsed() <= 2 * LOCKS_INTERVAL
+        let last = *self.last_locks.lock();
+        last.is_some_and(|last| last.elapsed() <= 2 * LOCKS_INTERVAL)
     }
 
     /// Shows the goals that run.
