@@ -6,8 +6,7 @@ const COLUMNS = [
   { title: 'Action' }, { title: 'Robot' }, { title: 'Progress' }, { title: 'Since', class: 'optional' }, { title: '' },
 ];
 const CANCELLED_COLUMNS = [
-  { title: 'Time' }, { title: 'Action' }, { title: 'Robot' }, { title: 'For', class: 'optional' }, { title: 'By' },
-  { title: 'Outcome' },
+  { title: 'Time' }, { title: 'Action' }, { title: 'By' }, { title: 'Outcome' },
 ];
 
 function progress(row) {
@@ -22,9 +21,10 @@ function progress(row) {
 
 function cancelledRow(row) {
   return element('tr', {},
-    element('td', { class: 'short' }, clock(row.time)), element('td', { class: 'name' }, row.action),
-    element('td', {}, link('agent', row.robot)), element('td', { class: 'optional' }, link('agent', row.client)),
-    element('td', {}, link('agent', row.by)), element('td', {}, row.reason ?? row.state));
+    element('td', { class: 'short' }, clock(row.time)),
+    element('td', { class: 'act' }, row.action, element('div', { class: 'faint' }, 'of ', link('agent', row.robot)),
+      element('div', { class: 'faint' }, 'for ', link('agent', row.client))),
+    element('td', { class: 'name' }, link('agent', row.by)), element('td', {}, row.reason ?? row.state));
 }
 
 /** Tables of goals: those that run, and those that this page has cancelled. */
@@ -40,8 +40,12 @@ export function goalTables() {
       method: 'POST', headers: { 'X-Fipa': '1', 'Content-Type': 'application/json' },
       body: JSON.stringify({ robot, goal, client }),
     }).catch((error) => ({ ok: false, text: () => error.message }));
-    pending.delete(key);
-    button.disabled = false;
+    // The row of a goal that has ended disappears. A row that has changed has another button.
+    if (!answer.ok) {
+      pending.delete(key);
+      const buttons = [...running.node.querySelectorAll('button')];
+      buttons.filter((shown) => shown.dataset.key === key).forEach((shown) => { shown.disabled = false; });
+    }
     const ended = answer.ok ? await answer.json() : null;
     result.textContent = ended
       ? `${ended.action} of ${ended.robot}: ${ended.reason ?? ended.state}`
@@ -58,7 +62,7 @@ export function goalTables() {
         element('div', { class: 'faint optional' }, row.goal)),
       element('td', {}, link('agent', row.robot)), element('td', {}, progress(row)),
       element('td', { class: 'optional' }, clock(row.since)),
-      element('td', {}, act));
+      element('td', { class: 'act' }, act));
   };
   const running = table('Running goals, asked every second', COLUMNS, goalRow);
   const cancelled = table('Cancelled from a page of this gateway, the newest first', CANCELLED_COLUMNS, cancelledRow);
@@ -67,6 +71,7 @@ export function goalTables() {
   const update = (sections) => {
     const goals = Object.entries(sections.goals ?? {}).sort(([a], [b]) => (a < b ? -1 : 1));
     const focused = document.activeElement?.dataset.key;
+    for (const key of pending) if (!(key in (sections.goals ?? {}))) pending.delete(key);
     running.rows.show(goals);
     // A row that changes gets another button.
     if (focused) [...running.node.querySelectorAll('button')].find((button) => button.dataset.key === focused)?.focus();
