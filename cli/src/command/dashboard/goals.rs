@@ -14,11 +14,7 @@ use fipa::admin::watch::Passage;
 use fipa::{Agent, AgentId, Incarnation, Performative, Reach, Role};
 use parking_lot::Mutex;
 
-use super::observation::Observation;
 use crate::command::ask::ask_all;
-
-/// Time between two questions to the agents.
-const INTERVAL: Duration = Duration::from_secs(1);
 
 /// Maximum wait for the answers of the agents.
 const ANSWER: Duration = Duration::from_secs(2);
@@ -36,6 +32,16 @@ pub(super) struct RunningGoal {
     pub(super) is_answered: bool,
     /// Whether the robot lets the agent of the page cancel it; `None` if clients may only see.
     pub(super) may_cancel: Option<bool>,
+}
+
+/// A goal that a client of the page has cancelled.
+#[derive(Debug)]
+pub(super) struct Cancelled {
+    pub(super) at: SystemTime,
+    /// The agent of the page.
+    pub(super) by: String,
+    pub(super) robot: String,
+    pub(super) status: GoalStatus,
 }
 
 /// The agents that may run goals, by name.
@@ -61,27 +67,6 @@ fn key(status: &GoalStatus) -> GoalKey {
     (status.client.clone(), status.goal.clone())
 }
 
-/// Asks the agents for their goals again and again while a page shows them.
-pub(super) async fn ask(observation: &Observation, robots: &Robots, agent: &Arc<Agent>) {
-    loop {
-        tokio::time::sleep(INTERVAL).await;
-        if !observation.shows_locks() {
-            continue;
-        }
-        robots.look(agent);
-        let answers = ask_all(robots.to_ask(), |robot| {
-            let agent = Arc::clone(agent);
-            within_time(async move { agent.robot(robot).status().await })
-        });
-        robots.take(answers.await);
-        let page_agent = observation.orders.agent();
-        if let Some(page_agent) = &page_agent {
-            robots.judge(page_agent).await;
-        }
-        observation.show_goals(&robots.goals(page_agent.is_some()));
-    }
-}
-
 /// The error of a question.
 #[derive(Debug, thiserror::Error)]
 enum QuestionError {
@@ -99,6 +84,24 @@ async fn within_time<T>(
 }
 
 impl Robots {
+    /// Asks the agents for their goals. `page_agent` is the agent of the page, if clients may cancel goals.
+    pub(super) async fn ask(
+        &self,
+        agent: &Arc<Agent>,
+        page_agent: Option<&Arc<Agent>>,
+    ) -> Vec<RunningGoal> {
+        self.look(agent);
+        let answers = ask_all(self.to_ask(), |robot| {
+            let agent = Arc::clone(agent);
+            within_time(async move { agent.robot(robot).status().await })
+        });
+        self.take(answers.await);
+        if let Some(page_agent) = page_agent {
+            self.judge(page_agent).await;
+        }
+        self.goals(page_agent.is_some())
+    }
+
     /// Notices the robot of a letter about actions.
     pub(super) fn notice(&self, passage: &Passage) {
         let Some(message) = passage.message.as_ref() else {

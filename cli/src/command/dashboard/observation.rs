@@ -12,8 +12,8 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, mpsc};
 use tokio::time::{Instant, MissedTickBehavior};
 
-use super::goals::{self, Robots, RunningGoal};
-use super::orders::{Cancelled, Orders};
+use super::goals::{Cancelled, Robots};
+use super::orders::Orders;
 use super::picture::{Picture, Wanted};
 use super::view::View;
 use crate::command::top::{self, Observer};
@@ -32,6 +32,9 @@ const WINDOW: Duration = Duration::from_secs(5);
 
 /// Time between two questions to the owners of locks, and maximum wait for their answers.
 const LOCKS_INTERVAL: Duration = Duration::from_secs(2);
+
+/// Time between two questions to the robots.
+const GOALS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Time before the next attempt to observe the domain.
 const RETRY: Duration = Duration::from_secs(5);
@@ -76,14 +79,9 @@ impl Observation {
     }
 
     /// Whether a page shows locks and goals.
-    pub(super) fn shows_locks(&self) -> bool {
+    fn shows_locks(&self) -> bool {
         let last = *self.last_locks.lock();
         last.is_some_and(|last| last.elapsed() <= 2 * LOCKS_INTERVAL)
-    }
-
-    /// Shows the goals that run.
-    pub(super) fn show_goals(&self, goals: &[RunningGoal]) {
-        self.picture.lock().goals.take(goals);
     }
 
     /// Shows a goal that a client of the page has cancelled.
@@ -184,7 +182,7 @@ async fn follow(
         () = watching => false,
         () = top::ask(asker, sender) => false,
         () = ask_for_locks(observation, &locks_asker, locks_sender) => false,
-        () = goals::ask(observation, &robots, &locks_asker) => false,
+        () = ask_for_goals(observation, &robots, &locks_asker) => false,
         served = observation.orders.serve(domain, config) => {
             served?;
             false
@@ -223,6 +221,18 @@ async fn ask_for_locks(
             Err(error) => {
                 tracing::debug!(error = %ErrorChain(&error), "the owners of locks cannot be asked")
             }
+        }
+    }
+}
+
+/// Asks all robots for their goals again and again while a page shows them.
+async fn ask_for_goals(observation: &Observation, robots: &Robots, agent: &Arc<Agent>) {
+    loop {
+        tokio::time::sleep(GOALS_INTERVAL).await;
+        if observation.shows_locks() {
+            let page_agent = observation.orders.agent();
+            let goals = robots.ask(agent, page_agent.as_ref()).await;
+            observation.picture.lock().goals.take(&goals);
         }
     }
 }

@@ -4,13 +4,14 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa::actions::{ActionError, GoalRef, GoalStatus};
+use fipa::actions::{ActionError, GoalRef};
 use fipa::error::ErrorChain;
 use fipa::{Agent, AgentId, Config, Domain, Performative, RegisterOptions};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
+use super::goals::Cancelled;
 use super::picture::clipped;
 use crate::membership;
 use crate::report::Failure;
@@ -41,16 +42,6 @@ struct CancelOrder {
     robot: String,
     goal: String,
     client: String,
-}
-
-/// A goal that a client of the page has cancelled.
-#[derive(Debug)]
-pub(super) struct Cancelled {
-    pub(super) at: SystemTime,
-    /// The agent of the page.
-    pub(super) by: String,
-    pub(super) robot: String,
-    pub(super) status: GoalStatus,
 }
 
 /// The error of an order.

@@ -5,8 +5,7 @@ use std::collections::VecDeque;
 use serde_json::{Value, json};
 
 use super::{clipped, moment};
-use crate::command::dashboard::goals::RunningGoal;
-use crate::command::dashboard::orders::Cancelled;
+use crate::command::dashboard::goals::{Cancelled, RunningGoal};
 use crate::command::dashboard::view::View;
 
 /// Maximum number of goals that run.
