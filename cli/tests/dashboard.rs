@@ -2,22 +2,30 @@
 
 #![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
+#[path = "dashboard/actions.rs"]
+mod actions;
 #[path = "common/browser.rs"]
 mod browser;
 mod common;
+#[path = "dashboard/dock.rs"]
+mod dock;
+#[path = "dashboard/hostile.rs"]
+mod hostile;
 #[path = "common/listener.rs"]
 mod listener;
+#[path = "dashboard/memory.rs"]
+mod memory;
 
 use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
-use std::net::TcpStream;
+use std::net::{SocketAddr, TcpStream};
 use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
 
 use browser::Browser;
 use common::Host;
-use fipa_testbed::{ChildGuard, until};
+use fipa_testbed::{AnyPeer, ChildGuard, until};
 use listener::Shown;
 use serde_json::Value;
 
@@ -278,6 +286,8 @@ fn the_description_of_the_interface_is_what_the_gateway_answers() {
         head.contains("image/svg+xml") && svg.contains("agreed"),
         "{svg}"
     );
+    let _robot = actions::Robot::start(&host, "crex", &[]);
+    let _driving = actions::drive(&host, "crex");
     for (path, description_of_path) in description["paths"].as_object().unwrap() {
         let Some(get) = description_of_path.get("get") else {
             continue;
@@ -297,8 +307,8 @@ fn the_description_of_the_interface_is_what_the_gateway_answers() {
         until(path, || {
             view = answer(&format!("{path}{given}"));
             let sections = schema["properties"].as_object().unwrap();
-            // There is no other host, and all letters are delivered.
-            let may_be_empty = |section: &str| matches!(section, "hosts" | "reasons");
+            // There is no other host, all letters are delivered, and nothing is cancelled.
+            let may_be_empty = |section: &str| matches!(section, "hosts" | "reasons" | "cancelled");
             let has_rows = |section: &str| {
                 may_be_empty(section) || view[section].as_object().is_some_and(|it| !it.is_empty())
             };
@@ -373,6 +383,7 @@ fn the_command_prints_the_link() {
     assert_eq!(host.run(&["dashboard"]).done(), format!("{link}\n"));
     let found = host.run(&["dashboard", "--json"]).done_json();
     assert_eq!(found["link"], link.as_str());
+    assert_eq!(found["fingerprint"], Value::Null);
 }
 
 /// The rows that the page shows, as lines of text.
@@ -544,13 +555,35 @@ fn locks_have_their_holders_and_lost_hosts_stay_in_sight() {
     assert_no_messages(&browser);
 }
 
+/// The SHA-256 of the certificate that a listener presents.
+fn presented(address: SocketAddr) -> String {
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let config = rustls::ClientConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .unwrap()
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(AnyPeer))
+        .with_no_client_auth();
+    let name = "localhost".try_into().unwrap();
+    let mut connection = rustls::ClientConnection::new(Arc::new(config), name).unwrap();
+    let mut stream = TcpStream::connect(("localhost", address.port())).unwrap();
+    connection.complete_io(&mut stream).unwrap();
+    let certificate = &connection.peer_certificates().unwrap()[0];
+    let digest = ring::digest::digest(&ring::digest::SHA256, certificate);
+    digest
+        .as_ref()
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
+}
+
 #[test]
 fn other_hosts_reach_the_page_with_the_key_of_the_gateway_only() {
     let host = Host::new();
     let keys = host.path("keys");
-    let keys = keys.to_str().unwrap();
-    host.run(&["keys", "init", "--dir", keys]).done();
-    let keys = format!("security.keys={keys}");
+    let keys_dir = keys.to_str().unwrap();
+    host.run(&["keys", "init", "--dir", keys_dir]).done();
+    let keys = format!("security.keys={keys_dir}");
     for listen in ["0.0.0.0:0", "[::]:0"] {
         let shown = Shown::start(&host, listen, &[&keys]);
         // Without TLS, there is no answer.
@@ -563,7 +596,16 @@ fn other_hosts_reach_the_page_with_the_key_of_the_gateway_only() {
         let link = host
             .run(&["dashboard", "--set", &keys, "--json"])
             .done_json();
+        let own = host
+            .run(&["keys", "list", "--dir", keys_dir, "--json"])
+            .done_json();
+        let fingerprint = own["own"]["fingerprint"].as_str().unwrap();
+        assert_eq!(link["fingerprint"], fingerprint);
+        let text = host.run(&["dashboard", "--set", &keys]).done();
+        assert_eq!(presented(shown.address), fingerprint);
         let link = link["link"].as_str().unwrap();
+        let expected = format!("{link}\nfingerprint of the certificate (SHA-256): {fingerprint}\n");
+        assert_eq!(text, expected);
         assert!(link.starts_with("https://"), "{link}");
         let name = "other_hosts_reach_the_page_with_the_key_of_the_gateway_only";
         let Some(browser) = Browser::open(name, 1280, 800) else {
@@ -674,6 +716,15 @@ fn clients_send_messages_only_with_control_and_as_an_agent_of_the_host() {
     assert_no_messages(&browser);
 }
 
+/// The configuration of a process of this host.
+fn config_of(host: &Host) -> fipa::Config {
+    let mut config = fipa::Config::for_host("test");
+    config.domain.clone_from(&host.domain);
+    config.runtime_dir = host.path("run").to_str().unwrap().to_owned();
+    config.discovery.mdns = false;
+    config
+}
+
 /// Time of the soak, in minutes.
 const SOAK: u64 = 10;
 
@@ -707,10 +758,7 @@ fn soak() {
     let host = Host::new();
     let shown = Shown::start(&host, "127.0.0.1:0", &[]);
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let mut config = fipa::Config::for_host("soak");
-    config.domain.clone_from(&host.domain);
-    config.runtime_dir = host.path("run").to_str().unwrap().to_owned();
-    config.discovery.mdns = false;
+    let config = config_of(&host);
     let domain = runtime.block_on(fipa::Domain::open(&config)).unwrap();
     let mut agents = Vec::new();
     for number in 0..AGENTS {

@@ -53,7 +53,7 @@
 //! listen = ""                         # of the gateway, for Prometheus: "127.0.0.1:9790"; empty: off
 //! names = []                          # further names under which clients reach that address
 //! token_file = ""                     # file with the token of clients; empty: in the directory of the domain
-//! control = false                     # true: clients with the token send messages as dashboard@<mts.name>
+//! control = false                     # true: clients send messages and cancel actions as dashboard@<mts.name>
 //! [contacts]
 //! networks = []                       # networks whose addresses in received identifiers are dialed
 //! [access]
@@ -328,7 +328,8 @@ pub struct Http {
     /// `token_file`: the file with the token that clients send. The gateway creates it if it is missing. Empty: the file
     /// `http.token` in the directory of the domain, which ends with the domain.
     pub token_file: String,
-    /// `control`: whether clients send messages, too, as the agent `dashboard@<mts.name>`. Otherwise they only see.
+    /// `control`: whether clients send messages and cancel actions, too, as the agent `dashboard@<mts.name>`. Otherwise they
+    /// only see.
     pub control: bool,
 }
 

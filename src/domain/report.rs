@@ -70,6 +70,9 @@ pub struct HttpListener {
     pub url: String,
     /// The file with the token that clients send.
     pub token_file: String,
+    /// The SHA-256 of the certificate that it presents, as 64 hexadecimal digits; `None` without encryption.
+    #[serde(default)]
+    pub fingerprint: Option<String>,
 }
 
 /// A name that an agent of this host and an agent of another host have.

@@ -18,6 +18,7 @@ mod metrics;
 mod names;
 mod namesakes;
 mod neighbors;
+mod open_listener;
 mod platform_agents;
 mod publish_pace;
 mod self_check;
@@ -59,6 +60,7 @@ use self::introductions::Takers;
 use self::namesakes::Namesakes;
 pub use self::neighbors::Neighbor;
 use self::neighbors::{Neighbors, View};
+use self::open_listener::OpenListener;
 use self::platform_agents::PlatformAgents;
 use self::self_check::Arrivals;
 pub use self::self_check::{SelfCheck, SelfCheckError};
@@ -98,7 +100,7 @@ pub struct Gateway {
     /// The letters of the gateway to itself that have arrived.
     arrivals: Arrivals,
     /// The HTTP listener, as soon as it is open.
-    http: Arc<OnceLock<HttpListener>>,
+    http: Arc<OnceLock<OpenListener>>,
     /// Encrypts at a listener that other hosts reach.
     #[cfg(feature = "web")]
     encryption: Option<Encryption>,
@@ -355,13 +357,22 @@ impl Gateway {
         } else {
             "http"
         };
+        #[cfg(feature = "secure")]
+        let security = encryption
+            .as_ref()
+            .map(|Encryption(security)| security.clone());
         let listener = Listener::open(&http.listen, &http.names, token, encryption)?;
         let address = listener.address();
         // Set only here.
-        let _ = self.http.set(HttpListener {
-            address,
-            url: format!("{scheme}://{}", self.reached_at(address)),
-            token_file: token_file.to_string_lossy().into_owned(),
+        let _ = self.http.set(OpenListener {
+            listener: HttpListener {
+                address,
+                url: format!("{scheme}://{}", self.reached_at(address)),
+                token_file: token_file.to_string_lossy().into_owned(),
+                fingerprint: None,
+            },
+            #[cfg(feature = "secure")]
+            security,
         });
         let shown = metrics::Shown {
             service: Arc::clone(&self.service),
@@ -511,8 +522,8 @@ impl Gateway {
 
     /// Returns the listener for metrics and pages, if `http.listen` is set.
     #[must_use]
-    pub fn http(&self) -> Option<&HttpListener> {
-        self.http.get()
+    pub fn http(&self) -> Option<HttpListener> {
+        self.http.get().map(OpenListener::report)
     }
 
     /// Returns the current problem of the discovery of other hosts, if there is one, and its changes.

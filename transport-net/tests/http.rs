@@ -17,7 +17,7 @@ use common::{Party, Recorder, config, letter_parcel, message_parcel};
 use fipa_acl::{
     AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
 };
-use fipa_testbed::until_some;
+use fipa_testbed::{hostile_requests, until_some};
 use fipa_transport::{
     Answer, Conclusion, FailureReason, Kind, Location, Parcel, Transport as _, TransportErrorKind,
 };
@@ -229,6 +229,33 @@ fn other_requests_are_answered_with_their_status_and_end_the_connection() {
     jade.write_all(STRING).unwrap();
     assert_eq!(answer(&mut jade), OK);
     assert_eq!(messages(&party, 1).len(), 1);
+}
+
+#[test]
+fn malformed_and_ambiguous_requests_carry_no_letter() {
+    let party = party();
+    let text = String::from_utf8(STRING.to_vec()).unwrap();
+    let (head, _) = text.split_once("\r\n\r\n").unwrap();
+    let fields = head.lines().skip(1);
+    let fields = fields.filter(|field| !field.to_ascii_lowercase().starts_with("content-length"));
+    let fields: String = fields.map(|field| format!("{field}\r\n")).collect();
+    for (name, request) in hostile_requests("POST", "/acc", &fields, &text) {
+        let mut client = connect(&party);
+        // The endpoint closes the connection before it has read all.
+        let _ = client.write_all(&request);
+        let _ = client.shutdown(Shutdown::Write);
+        let mut all = Vec::new();
+        let _ = client.read_to_end(&mut all);
+        let all = String::from_utf8_lossy(&all);
+        let answers = ["HTTP/1.1 4", "HTTP/1.1 505 "];
+        let is_refused = all.is_empty() || answers.iter().any(|it| all.starts_with(it));
+        assert!(is_refused, "{name}: {all}");
+        assert!(all.matches("HTTP/").count() <= 1, "{name}: {all}");
+    }
+    assert!(party.sink.record.lock().unframed.is_empty());
+    let mut jade = connect(&party);
+    jade.write_all(STRING).unwrap();
+    assert_eq!(answer(&mut jade), OK);
 }
 
 #[test]

@@ -46,7 +46,8 @@ Examples:
 
 JSON, one line when the gateway is ready:
   { \"name\": text, \"incarnation\": text, \"domain\": text, \"locations\": [ text ],
-    \"http\": { \"address\": text, \"url\": text, \"token_file\": text } or null without http.listen,
+    \"http\": { \"address\": text, \"url\": text, \"token_file\": text,
+      \"fingerprint\": text or null without encryption } or null without http.listen,
     \"recorder\": name of the agent that records, or null without record.directory,
     \"discovery\": { \"mdns\": true or false, \"problem\": text, if there is one },
     \"security\": { \"encrypted\": true or false, \"insecure\": security.insecure,
@@ -166,7 +167,7 @@ fn ready(
         url, token_file, ..
     }) = gateway.http()
     {
-        let token = escape(token_file);
+        let token = escape(&token_file);
         text.push_str(&format!(
             "  metrics at {url}/metrics, with the token in {token}\n  \
                dashboard: run `fipa dashboard` for its link\n"

@@ -11,7 +11,12 @@ use crate::report::{Claim, Reporter, micros};
 
 /// Runs the gateway of a host.
 pub(crate) async fn gateway(part: &Part) -> Result<(), Failed> {
-    let gateway = Gateway::open(&part.config()?).await?;
+    serve(part, Gateway::open(&part.config()?).await?).await;
+    Ok(())
+}
+
+/// Runs this gateway as that of a host, until standard input ends.
+pub async fn serve(part: &Part, gateway: Gateway) {
     let reporter = Reporter::new(&part.name);
     let locations = gateway.locations();
     let locations = locations.iter().map(ToString::to_string).collect();
@@ -19,7 +24,6 @@ pub(crate) async fn gateway(part: &Part) -> Result<(), Failed> {
     reporter.claim(Claim::Ready);
     Stop::default().requested().await;
     gateway.close().await;
-    Ok(())
 }
 
 /// Reports the letters of a host.

@@ -15,7 +15,7 @@ use tokio::process::{Child, ChildStdin, Command};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, timeout_at};
 
-use crate::part::{Failed, Mutant, Part, Role};
+use crate::part::{Failed, Mutant, Part, Role, Stop};
 pub use crate::relay::Link;
 use crate::relay::Relay;
 use crate::report::{Claim, Report, now};
@@ -65,6 +65,9 @@ pub struct Options {
     pub item: Option<Vec<OsString>>,
     /// The program of the operator, if it is another one.
     pub operator: Option<Vec<OsString>>,
+    /// Whether the first gateway has an HTTP listener. The run then waits for a line of standard input before its work, and
+    /// before its end.
+    pub dashboard: bool,
 }
 
 /// The result of a run.
@@ -171,6 +174,8 @@ impl Run<'_> {
             self.start(&format!("{host}-watcher"), Role::Watcher, host, show)
                 .await?;
         }
+        let mut input = self.options.dashboard.then(Stop::default);
+        self.wait_for_line(&mut input, "start", show).await?;
         if self.options.fault == Some(Fault::Rogue) {
             self.start("rogue", Role::Rogue, here, show).await?;
         }
@@ -197,6 +202,20 @@ impl Run<'_> {
         }
         self.spawn("checker", Role::Checker, here)?;
         while !matches!(self.next(until, show).await?.claim, Claim::Checked { .. }) {}
+        self.wait_for_line(&mut input, "end", show).await
+    }
+
+    /// Waits for a line of standard input, or for its end. Returns at once without a dashboard.
+    async fn wait_for_line(
+        &mut self,
+        input: &mut Option<Stop>,
+        step: &str,
+        show: &mut dyn FnMut(&Report),
+    ) -> Result<(), Failed> {
+        let Some(input) = input else { return Ok(()) };
+        let step = step.to_owned();
+        self.claim(Claim::Waits { step }, show)?;
+        input.line().await;
         Ok(())
     }
 
@@ -378,6 +397,9 @@ impl Run<'_> {
                 set.push("transport.tcp.listen=[]".to_owned());
             }
             None => set.push("transport.tcp.listen=127.0.0.1:0".to_owned()),
+        }
+        if role == Role::Gateway && host == HOSTS[0].0 && self.options.dashboard {
+            set.push("http.listen=127.0.0.1:0".to_owned());
         }
         set
     }

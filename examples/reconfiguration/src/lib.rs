@@ -46,6 +46,8 @@ pub mod world;
 use std::time::Duration;
 
 pub use self::fault::Fault;
+#[cfg(feature = "robots")]
+pub use self::host::serve as serve_gateway;
 
 /// The name of the merged robot.
 pub const COALITION: &str = "crex_stack";

@@ -45,6 +45,10 @@ pub enum Claim {
     Opened { face: Face },
     /// A gateway listens here.
     Listening { locations: Vec<String> },
+    /// A gateway shows its domain on this page.
+    Page { link: String },
+    /// The launcher waits for a line of standard input before this step.
+    Waits { step: String },
     /// A watcher: a letter of its host. `fences` has those of the message.
     Letter {
         sender: String,

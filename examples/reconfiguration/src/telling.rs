@@ -9,6 +9,8 @@ pub fn told(report: &Report) -> Option<String> {
     Some(match &report.claim {
         Claim::Started { fault, seed } => format!("fault: {fault}, seed {seed}"),
         Claim::Fault { what } => format!("FAULT: {what}"),
+        Claim::Page { link } => format!("{by} shows the robots at {link}"),
+        Claim::Waits { step } => format!("press Enter to {step}"),
         Claim::Found { service, agents } => {
             format!("{by} finds the service {service}: {}", agents.join(", "))
         }

@@ -28,11 +28,12 @@ use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
 use super::introductions::Grounds;
 use super::namesakes::Namesakes;
 use super::neighbors::Neighbors;
+use super::open_listener::OpenListener;
 use super::self_check::Arrivals;
 use crate::admin::contact::{self, Introduced};
 use crate::admin::routes;
 use crate::domain::presence;
-use crate::domain::report::{self, HttpListener};
+use crate::domain::report;
 use crate::domain::service::Service;
 
 /// Deadline for the delivery of an answer.
@@ -53,7 +54,7 @@ pub(crate) struct GatewayAgent {
     /// The values of the configuration in use, by key.
     pub(super) configuration: Arc<Mutex<BTreeMap<String, String>>>,
     /// The HTTP listener, as soon as it is open.
-    pub(super) http: Arc<OnceLock<HttpListener>>,
+    pub(super) http: Arc<OnceLock<OpenListener>>,
     /// The connections that were refused because of keys or versions.
     pub(super) refusals: Refusals,
     /// The connections of this gateway that peers refused.
@@ -277,7 +278,7 @@ impl GatewayAgent {
             contested: self.exchange.contested(),
             namesakes: self.namesakes.found(Instant::now()),
             configuration: self.configuration.lock().clone(),
-            http: self.http.get().cloned(),
+            http: self.http.get().map(OpenListener::report),
             locations: self.service.shown_locations(),
             ..self.service.report(&entries)
         };

@@ -34,6 +34,7 @@
 
 mod avahi;
 mod child;
+mod http_requests;
 pub mod languages;
 mod network;
 mod packet_repeater;
@@ -45,6 +46,7 @@ use std::process::Command;
 
 pub use avahi::Avahi;
 pub use child::{ChildGuard, ignored_test, send_signal};
+pub use http_requests::hostile_requests;
 pub use network::{Family, Host, Network};
 pub use packet_repeater::PacketRepeater;
 #[cfg(feature = "tls")]

@@ -204,6 +204,12 @@ impl Security {
         self.replaced.subscribe()
     }
 
+    /// Returns the fingerprint of the certificate that this host presents now.
+    #[must_use]
+    pub fn own(&self) -> Fingerprint {
+        self.now.read().own.fingerprint()
+    }
+
     /// Whether a peer with this certificate is trusted now.
     #[must_use]
     pub fn trusts(&self, fingerprint: Fingerprint) -> bool {

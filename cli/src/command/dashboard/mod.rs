@@ -2,10 +2,12 @@
 //!
 //! * [`observation`] observes the domain while pages show it; [`picture`] is the state of the domain.
 //! * [`offers`] follows the agents at which pages look.
-//! * [`orders`] sends messages for clients, if `http.control` permits it.
+//! * [`goals`] asks agents for the goals that they run.
+//! * [`orders`] sends messages and cancels goals for clients, if `http.control` permits it.
 //! * [`pages`] answers requests; [`view`] has the rows of a view, and their changes.
 //! * `assets/` is the page: plain JavaScript modules without a build step.
 
+mod goals;
 mod observation;
 mod offers;
 mod orders;
@@ -22,6 +24,7 @@ use std::sync::Arc;
 
 use clap::Args;
 use fipa::Config;
+use fipa::admin::routes::HttpListener;
 use fipa::web::Pages;
 use fipa_acl::escape;
 use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
@@ -39,12 +42,13 @@ use crate::report::Failure;
 /// Show the robots of the domain on a web page of the gateway
 ///
 /// Prints the link of the page, and opens it in a browser if this is a desktop. The page shows hosts and agents, the
-/// links between hosts, the topics of agents, conversations and their violations, locks, letters with their ways, and
-/// the last minutes again. It changes nothing.
+/// links between hosts, the topics of agents, conversations and their violations, locks, running actions, letters with
+/// their ways, and the last minutes again. It changes nothing, unless http.control is true.
 ///
 /// The gateway must have the option http.listen. Everyone who has the link sees the domain: it contains the token of
 /// the gateway, which only the user of the gateway can read. If http.listen is an address that other hosts reach, the page
-/// is encrypted with the key of the gateway, and the browser asks once whether it may trust this key.
+/// is encrypted with the key of the gateway, and the browser asks once whether it may trust this key. The command prints
+/// the SHA-256 fingerprint of the certificate, to compare it with the one that the browser shows.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -55,7 +59,7 @@ Examples:
                                                     for a tablet in the same network
 
 JSON:
-  { \"domain\": text, \"address\": text, \"link\": text }")]
+  { \"domain\": text, \"address\": text, \"link\": text, \"fingerprint\": text or null without encryption }")]
 pub(crate) struct Arguments {
     /// Print the link only
     #[arg(long)]
@@ -89,6 +93,31 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             "set http.listen = \"127.0.0.1:9790\" in its configuration, and restart it",
         ));
     };
+    let link = link(&listener)?;
+    if arguments.json {
+        let address = listener.address.to_string();
+        return output::json(&json!({
+            "domain": config.domain, "address": address, "link": link, "fingerprint": listener.fingerprint,
+        }));
+    }
+    output::text(&format!("{link}\n"))?;
+    if let Some(fingerprint) = &listener.fingerprint {
+        let fingerprint = escape(fingerprint);
+        output::text(&format!(
+            "fingerprint of the certificate (SHA-256): {fingerprint}\n"
+        ))?;
+    }
+    let is_desktop = ["DISPLAY", "WAYLAND_DISPLAY"]
+        .iter()
+        .any(|name| std::env::var_os(name).is_some());
+    if is_desktop && !arguments.no_browser && std::io::stdout().is_terminal() {
+        open_browser(&config, &link)?;
+    }
+    Ok(())
+}
+
+/// Returns the link of the page, with the token of the gateway.
+pub(super) fn link(listener: &HttpListener) -> Result<String, Failure> {
     let token = fs::read_to_string(&listener.token_file).map_err(|error| {
         Failure::failed(
             format!("cannot read the token of the gateway: {error}"),
@@ -98,19 +127,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     })?;
     // A token of the user's own may have characters that end a link or the attribute of a page.
     let token = utf8_percent_encode(token.trim_end(), NON_ALPHANUMERIC);
-    let link = format!("{}/#token={token}", listener.url);
-    if arguments.json {
-        let address = listener.address.to_string();
-        return output::json(&json!({ "domain": config.domain, "address": address, "link": link }));
-    }
-    output::text(&format!("{link}\n"))?;
-    let is_desktop = ["DISPLAY", "WAYLAND_DISPLAY"]
-        .iter()
-        .any(|name| std::env::var_os(name).is_some());
-    if is_desktop && !arguments.no_browser && std::io::stdout().is_terminal() {
-        open_browser(&config, &link)?;
-    }
-    Ok(())
+    Ok(format!("{}/#token={token}", listener.url))
 }
 
 /// Opens the link in a browser. The link goes through a file that only this user can read: all users see the

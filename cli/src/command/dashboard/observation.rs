@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa::admin::watch::{WatchOptions, Watcher};
+use fipa::admin::watch::{Event, WatchOptions, Watcher};
 use fipa::error::ErrorChain;
 use fipa::locks::ResourceStatus;
 use fipa::monitor::Library;
@@ -12,6 +12,7 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, mpsc};
 use tokio::time::{Instant, MissedTickBehavior};
 
+use super::goals::{Cancelled, Robots};
 use super::offers::{self, Offers};
 use super::orders::Orders;
 use super::picture::{Picture, Wanted};
@@ -33,6 +34,9 @@ const WINDOW: Duration = Duration::from_secs(5);
 /// Time between two questions to the owners of locks, and maximum wait for their answers.
 const LOCKS_INTERVAL: Duration = Duration::from_secs(2);
 
+/// Time between two questions to the robots.
+const GOALS_INTERVAL: Duration = Duration::from_secs(1);
+
 /// Time before the next attempt to observe the domain.
 const RETRY: Duration = Duration::from_secs(5);
 
@@ -46,12 +50,11 @@ pub(super) struct Observation {
     /// Ends the task that observes.
     stopped: Notify,
     last: Mutex<Instant>,
-    last_locks: Mutex<Instant>,
+    last_locks: Mutex<Option<Instant>>,
 }
 
 impl Observation {
     pub(super) fn new(orders: Orders) -> Arc<Self> {
-        let now = Instant::now();
         let picture = Picture::new(orders.are_permitted());
         Arc::new(Self {
             offers: Arc::default(),
@@ -59,8 +62,8 @@ impl Observation {
             picture: Mutex::new(picture),
             wanted: Notify::new(),
             stopped: Notify::new(),
-            last: Mutex::new(now),
-            last_locks: Mutex::new(now),
+            last: Mutex::new(Instant::now()),
+            last_locks: Mutex::default(),
         })
     }
 
@@ -72,7 +75,7 @@ impl Observation {
     /// Returns a view, and keeps the domain observed.
     pub(super) fn view(&self, wanted: &Wanted) -> Arc<View> {
         if *wanted == Wanted::Locks {
-            *self.last_locks.lock() = Instant::now();
+            *self.last_locks.lock() = Some(Instant::now());
         }
         self.keep();
         let mut view = self.picture.lock().view(wanted);
@@ -81,6 +84,17 @@ impl Observation {
             self.offers.put(name, Arc::make_mut(&mut view));
         }
         view
+    }
+
+    /// Whether a page shows locks and goals.
+    fn shows_locks(&self) -> bool {
+        let last = *self.last_locks.lock();
+        last.is_some_and(|last| last.elapsed() <= 2 * LOCKS_INTERVAL)
+    }
+
+    /// Shows a goal that a client of the page has cancelled.
+    pub(super) fn show_cancelled(&self, cancelled: &Cancelled) {
+        self.picture.lock().goals.add_cancelled(cancelled);
     }
 
     /// Keeps the domain observed.
@@ -139,7 +153,8 @@ async fn follow(
     checker: Checker,
 ) -> Result<bool, Failure> {
     let asker = membership::asker(domain).await?;
-    let locks_asker = register(domain, config).await?;
+    let locks_asker = Arc::new(register(domain, config).await?);
+    let robots = Robots::default();
     let own = vec![asker.name().to_owned(), locks_asker.name().to_owned()];
     let watcher = Watcher::open(config, WatchOptions::default()).await;
     let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
@@ -153,6 +168,9 @@ async fn follow(
             tokio::select! {
                 event = watcher.next() => {
                     let checked = observer.event(&event, &watcher);
+                    if let (Event::Letter(passage), Some(_)) = (&event, &checked) {
+                        robots.notice(passage);
+                    }
                     observation.picture.lock().handle(&event, checked.as_ref());
                 }
                 Some(report) = reports.recv() => observer.report(report),
@@ -173,6 +191,7 @@ async fn follow(
         () = top::ask(asker, sender) => false,
         () = ask_for_locks(observation, &locks_asker, locks_sender) => false,
         () = offers::serve(&observation.offers, &locks_asker) => false,
+        () = ask_for_goals(observation, &robots, &locks_asker) => false,
         served = observation.orders.serve(domain, config) => {
             served?;
             false
@@ -199,7 +218,7 @@ async fn ask_for_locks(
 ) {
     loop {
         tokio::time::sleep(LOCKS_INTERVAL).await;
-        if observation.last_locks.lock().elapsed() > 2 * LOCKS_INTERVAL {
+        if !observation.shows_locks() {
             continue;
         }
         match agent.query_locks(LOCKS_INTERVAL).await {
@@ -211,6 +230,18 @@ async fn ask_for_locks(
             Err(error) => {
                 tracing::debug!(error = %ErrorChain(&error), "the owners of locks cannot be asked")
             }
+        }
+    }
+}
+
+/// Asks all robots for their goals again and again while a page shows them.
+async fn ask_for_goals(observation: &Observation, robots: &Robots, agent: &Arc<Agent>) {
+    loop {
+        tokio::time::sleep(GOALS_INTERVAL).await;
+        if observation.shows_locks() {
+            let page_agent = observation.orders.agent();
+            let goals = robots.ask(agent, page_agent.as_ref()).await;
+            observation.picture.lock().goals.take(&goals);
         }
     }
 }

@@ -1,21 +1,26 @@
-//! Messages that a client of the page sends, as the agent `dashboard@<mts.name>`. The rules of access of the receivers
-//! apply to it as to every agent.
+//! Messages that a client of the page sends and goals that it cancels, as the agent `dashboard@<mts.name>`. The rules of
+//! access of the receivers apply to it as to every agent.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
+use fipa::actions::{ActionError, GoalRef};
 use fipa::error::ErrorChain;
-use fipa::{Agent, Config, Domain, Performative, RegisterOptions};
+use fipa::{Agent, AgentId, Config, Domain, Performative, RegisterOptions};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
+use super::goals::Cancelled;
 use super::picture::clipped;
 use crate::membership;
 use crate::report::Failure;
 
 /// Maximum wait for the outcome of a message.
 const WITHIN: Duration = Duration::from_secs(10);
+
+/// Maximum wait for the end of a goal. Shorter than the time of a connection, so that the client gets an answer.
+const STOP: Duration = Duration::from_secs(8);
 
 /// A message to send.
 #[derive(Debug, Deserialize)]
@@ -28,6 +33,15 @@ struct Order {
     ontology: Option<String>,
     protocol: Option<String>,
     conversation: Option<String>,
+}
+
+/// A goal to cancel.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct CancelOrder {
+    robot: String,
+    goal: String,
+    client: String,
 }
 
 /// The error of an order.
@@ -49,6 +63,15 @@ pub(super) enum OrderError {
     /// The message cannot be sent.
     #[error("{}", ErrorChain(.0))]
     Send(#[from] fipa::error::SendError),
+    /// The name of the robot is none.
+    #[error("{}", ErrorChain(.0))]
+    Name(#[from] fipa::error::AgentIdError),
+    /// The robot does not cancel the goal.
+    #[error("{}", ErrorChain(.0))]
+    Robot(#[from] ActionError),
+    /// The goal has not ended in time.
+    #[error("the goal has not ended within {STOP:?}; the list shows whether it goes on")]
+    GoesOn,
 }
 
 /// The agent of the page.
@@ -108,10 +131,7 @@ impl Orders {
         } = serde_json::from_slice(order)?;
         let known: Result<Performative, _> = performative.parse();
         let performative = known.map_err(|_| OrderError::Performative(clipped(&performative)))?;
-        let mut agent = self.agent.subscribe();
-        let registered = tokio::time::timeout(WITHIN, agent.wait_for(Option::is_some)).await;
-        let agent = registered.ok().and_then(|agent| agent.ok()?.clone());
-        let agent = agent.ok_or(OrderError::NotReady)?;
+        let agent = self.registered().await?;
         let mut message = agent.message(performative).receiver(to);
         if let Some(content) = content {
             message = message.content(content);
@@ -130,6 +150,39 @@ impl Orders {
         }
         let deliveries = agent.send_within(message, WITHIN).await?;
         Ok(json!({ "deliveries": deliveries }))
+    }
+
+    /// Cancels a goal, and waits until it has ended. Waits for the registration of the agent.
+    ///
+    /// # Errors
+    /// If clients may only see, the order is not valid, or the robot does not cancel the goal.
+    pub(super) async fn cancel(&self, order: &[u8]) -> Result<Cancelled, OrderError> {
+        if !self.is_permitted {
+            return Err(OrderError::NoControl);
+        }
+        let order: CancelOrder = serde_json::from_slice(order)?;
+        let agent = self.registered().await?;
+        let robot = agent.robot(AgentId::new(&*order.robot)?);
+        let cancelled = robot.cancel(GoalRef::from(order.goal).of(order.client));
+        let cancelled = tokio::time::timeout(STOP, cancelled).await;
+        Ok(Cancelled {
+            status: cancelled.map_err(|_| OrderError::GoesOn)??,
+            at: SystemTime::now(),
+            by: agent.name().to_owned(),
+            robot: order.robot,
+        })
+    }
+
+    /// The agent of the page, if it is registered.
+    pub(super) fn agent(&self) -> Option<Arc<Agent>> {
+        self.agent.borrow().clone()
+    }
+
+    async fn registered(&self) -> Result<Arc<Agent>, OrderError> {
+        let mut agent = self.agent.subscribe();
+        let registered = tokio::time::timeout(WITHIN, agent.wait_for(Option::is_some)).await;
+        let agent = registered.ok().and_then(|agent| agent.ok()?.clone());
+        agent.ok_or(OrderError::NotReady)
     }
 }
 

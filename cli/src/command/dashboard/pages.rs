@@ -13,15 +13,17 @@ use axum::response::sse::{Event, Sse};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::{get, post};
 use axum::{Extension, Router};
+use fipa::actions::ActionError;
 use fipa::monitor::Library;
 use fipa::web::{KeepOpen, Pages};
 use futures_util::stream;
+use serde_json::Value;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, Interval, MissedTickBehavior};
 
 use super::observation::Observation;
 use super::orders::OrderError;
-use super::picture::Wanted;
+use super::picture::{Wanted, cancelled_object};
 use super::view::View;
 use crate::command::protocol::drawing;
 
@@ -38,7 +40,7 @@ const PACE: Duration = Duration::from_millis(200);
 const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
 
 /// The parts of the page: path, media type, content.
-const PARTS: [(&str, &str, &str); 18] = [
+const PARTS: [(&str, &str, &str); 19] = [
     (
         "/",
         "text/html; charset=utf-8",
@@ -78,6 +80,7 @@ const PARTS: [(&str, &str, &str); 18] = [
         include_str!("assets/coalitions.js"),
     ),
     ("/past.js", JAVASCRIPT, include_str!("assets/past.js")),
+    ("/goals.js", JAVASCRIPT, include_str!("assets/goals.js")),
     ("/locks.js", JAVASCRIPT, include_str!("assets/locks.js")),
     ("/letters.js", JAVASCRIPT, include_str!("assets/letters.js")),
     (
@@ -115,6 +118,7 @@ pub(super) fn pages(observation: Arc<Observation>, library: Arc<Library>) -> Pag
         .route("/api/protocol.svg", get(protocol))
         .route("/api/image", get(image))
         .route("/api/send", post(send))
+        .route("/api/cancel", post(cancel))
         .layer(DefaultBodyLimit::max(MAX_ORDER))
         .route("/api/{view}", get(snapshot))
         .with_state(shown);
@@ -209,15 +213,32 @@ async fn image(
 /// Sends a message, and answers with its outcomes.
 async fn send(State(shown): State<Shown>, order: Bytes) -> Response {
     shown.observation.keep();
-    match shown.observation.orders.send(&order).await {
-        Ok(outcomes) => {
-            let json = outcomes.to_string();
+    answer_to_order(shown.observation.orders.send(&order).await)
+}
+
+/// Cancels a goal, and answers with its end.
+async fn cancel(State(shown): State<Shown>, order: Bytes) -> Response {
+    shown.observation.keep();
+    let cancelled = shown.observation.orders.cancel(&order).await;
+    answer_to_order(cancelled.map(|cancelled| {
+        shown.observation.show_cancelled(&cancelled);
+        cancelled_object(&cancelled)
+    }))
+}
+
+fn answer_to_order(executed: Result<Value, OrderError>) -> Response {
+    match executed {
+        Ok(outcome) => {
+            let json = outcome.to_string();
             ([(CONTENT_TYPE, "application/json")], json).into_response()
         }
         Err(error) => {
             let status = match error {
-                OrderError::NoControl => StatusCode::FORBIDDEN,
+                OrderError::NoControl | OrderError::Robot(ActionError::Refused(_)) => {
+                    StatusCode::FORBIDDEN
+                }
                 OrderError::NotReady => StatusCode::SERVICE_UNAVAILABLE,
+                OrderError::Robot(_) | OrderError::GoesOn => StatusCode::GATEWAY_TIMEOUT,
                 _ => StatusCode::BAD_REQUEST,
             };
             (status, format!("{error}\n")).into_response()

@@ -5,15 +5,17 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
+use fipa::Gateway;
 use fipa_acl::escape;
 use fipa_reconfiguration::Fault;
 use fipa_reconfiguration::launch::{self, Link, Options, Outcome};
-use fipa_reconfiguration::part::{Mutant, Part};
+use fipa_reconfiguration::part::{Failed, Mutant, Part, Role};
 use fipa_reconfiguration::picture;
 use fipa_reconfiguration::report::{Claim, Report, Reporter};
 use fipa_reconfiguration::telling::told;
 use serde_json::json;
 
+use crate::command::dashboard::{self, Dashboard};
 use crate::membership::Stop;
 use crate::options;
 use crate::output;
@@ -33,7 +35,7 @@ use crate::report::Failure;
 #[derive(Debug, Args)]
 #[command(
     after_help = "Examples:\n  fipa demo dock\n  fipa demo dock --fault master-stopped --svg dock.svg\n  \
-                  fipa demo dock --fault random --seed 7\n  \
+                  fipa demo dock --fault random --seed 7\n  fipa demo dock --dashboard\n  \
                   fipa demo dock --operator examples/reconfiguration/stack_operator.py\n  \
                   fipa demo dock --json | jq '.reports[] | select(.claim == \"noticed\")'\n\nJSON:\n  \
                   { \"fault\", \"seed\", \"passed\": [checks], \"failed\": [checks with reasons],\n    \
@@ -64,6 +66,10 @@ pub(crate) struct Arguments {
     /// The program of the operator, which runs instead of this one, with its part as JSON
     #[arg(long, value_name = "PROGRAM")]
     operator: Option<OsString>,
+    /// Open the dashboard of the first gateway. The demo prints its link, and waits for Enter before the robots start and
+    /// before they end
+    #[arg(long, conflicts_with = "json")]
+    dashboard: bool,
     /// A defect that is built in
     #[arg(long, hide = true, value_parser = mutant)]
     mutant: Option<Mutant>,
@@ -108,6 +114,7 @@ pub(super) fn run(arguments: Arguments) -> Result<(), Failure> {
         program: launch::own_program(&["demo", "dock", "--part"]).map_err(failed)?,
         item: arguments.item.map(|program| vec![program]),
         operator: arguments.operator.map(|program| vec![program]),
+        dashboard: arguments.dashboard,
     };
     // A file that cannot be written is an error before the run, not after it.
     if let Some(file) = &arguments.svg {
@@ -141,7 +148,10 @@ pub(super) fn run(arguments: Arguments) -> Result<(), Failure> {
 }
 
 async fn run_part(part: &Part) -> Result<(), Failure> {
-    let ran = fipa_reconfiguration::run(part).await;
+    let ran = match part.role {
+        Role::Gateway => gateway(part).await,
+        _ => fipa_reconfiguration::run(part).await,
+    };
     ran.map_err(|error| {
         // The launcher reads it.
         let error = error.to_string();
@@ -150,6 +160,24 @@ async fn run_part(part: &Part) -> Result<(), Failure> {
         });
         failed(error)
     })
+}
+
+/// Runs a gateway with the dashboard, if the part has `http.listen`.
+async fn gateway(part: &Part) -> Result<(), Failed> {
+    let config = part.config()?;
+    if config.http.listen.is_empty() {
+        return fipa_reconfiguration::run(part).await;
+    }
+    let failed = |failure: Failure| failure.problem();
+    let (dashboard, pages) = Dashboard::start(&config).map_err(failed)?;
+    let gateway = Gateway::open_with_pages(&config, pages).await?;
+    if let Some(listener) = gateway.http() {
+        let link = dashboard::link(&listener).map_err(failed)?;
+        Reporter::new(&part.name).claim(Claim::Page { link });
+    }
+    fipa_reconfiguration::serve_gateway(part, gateway).await;
+    dashboard.close().await;
+    Ok(())
 }
 
 async fn launch(options: &Options, verbose: bool) -> Result<Outcome, Failure> {

@@ -4,6 +4,7 @@
 
 mod agents;
 mod conversations;
+mod goals;
 mod history;
 mod letters;
 mod partners;
@@ -18,6 +19,8 @@ use serde_json::{Value, json};
 
 use self::agents::Agents;
 use self::conversations::Conversations;
+use self::goals::Goals;
+pub(super) use self::goals::cancelled_object;
 use self::history::History;
 use self::letters::{Letter, Letters};
 use self::partners::Partners;
@@ -44,6 +47,7 @@ pub(super) struct Picture {
     letters: Letters,
     history: History,
     locks: Vec<ResourceStatus>,
+    pub(super) goals: Goals,
     /// The fleet at the last look.
     fleet: Arc<View>,
     /// The reason why the domain cannot be observed.
@@ -67,7 +71,7 @@ pub(super) enum Wanted {
     Conversations,
     /// A conversation with its letters.
     Conversation(String),
-    /// The resources that agents lock.
+    /// The resources that agents lock, and the goals that they run.
     Locks,
     /// The newest letters.
     Letters,
@@ -213,6 +217,8 @@ impl Picture {
         for lock in &self.locks {
             view.put("locks", lock.resource.as_str(), &locks::in_json(lock));
         }
+        self.goals.put(&mut view);
+        view.put("domain", "totals", &json!({ "control": self.has_control }));
         view
     }
 

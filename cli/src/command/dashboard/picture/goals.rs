@@ -1,0 +1,89 @@
+//! The goals that agents run, and those that a client of the page has cancelled.
+
+use std::collections::VecDeque;
+
+use serde_json::{Value, json};
+
+use super::{clipped, moment};
+use crate::command::dashboard::goals::{Cancelled, RunningGoal};
+use crate::command::dashboard::view::View;
+
+/// Maximum number of goals that run.
+const MAX_GOALS: usize = 200;
+
+/// Maximum number of cancelled goals.
+const MAX_CANCELLED: usize = 20;
+
+/// Goals as rows.
+#[derive(Debug, Default)]
+pub(in crate::command::dashboard) struct Goals {
+    running: Vec<(String, Value)>,
+    /// The newest last, each with its number.
+    cancelled: VecDeque<(u64, Value)>,
+    next: u64,
+}
+
+impl Goals {
+    /// Takes the goals that run. Further ones than 200 are left out.
+    pub(in crate::command::dashboard) fn take(&mut self, running: &[RunningGoal]) {
+        self.running = running.iter().take(MAX_GOALS).map(row).collect();
+    }
+
+    /// Takes a goal that a client of the page has cancelled.
+    pub(in crate::command::dashboard) fn add_cancelled(&mut self, cancelled: &Cancelled) {
+        if self.cancelled.len() >= MAX_CANCELLED {
+            self.cancelled.pop_front();
+        }
+        self.cancelled
+            .push_back((self.next, cancelled_object(cancelled)));
+        self.next += 1;
+    }
+
+    /// Adds the rows.
+    pub(super) fn put(&self, view: &mut View) {
+        for section in ["goals", "cancelled"] {
+            view.section(section);
+        }
+        for (key, row) in &self.running {
+            view.put("goals", key.as_str(), row);
+        }
+        for (number, row) in &self.cancelled {
+            view.put("cancelled", number.to_string(), row);
+        }
+    }
+}
+
+/// The row of a goal that runs, and its key. Two clients of a robot may use one identifier.
+fn row(goal: &RunningGoal) -> (String, Value) {
+    let RunningGoal {
+        robot,
+        status,
+        since,
+        is_answered,
+        may_cancel,
+    } = goal;
+    let progress = status.progress.as_ref();
+    let key = format!("{robot} {} {}", status.client, status.goal);
+    let row = json!({
+        "robot": robot, "goal": clipped(&status.goal), "action": clipped(&status.action),
+        "client": clipped(&status.client), "state": status.state.as_str(), "since": moment(*since),
+        "fraction": progress.and_then(|it| it.fraction), "note": progress.and_then(|it| it.note.as_deref()).map(clipped),
+        "answered": is_answered, "may_cancel": may_cancel,
+    });
+    (clipped(&key), row)
+}
+
+/// The object of a goal that a client of the page has cancelled.
+pub(in crate::command::dashboard) fn cancelled_object(cancelled: &Cancelled) -> Value {
+    let Cancelled {
+        at,
+        by,
+        robot,
+        status,
+    } = cancelled;
+    json!({
+        "time": moment(*at), "by": by, "robot": clipped(robot), "goal": clipped(&status.goal),
+        "action": clipped(&status.action), "client": clipped(&status.client), "state": status.state.as_str(),
+        "reason": status.failure.as_ref().map(|failure| clipped(&failure.to_string())),
+    })
+}
