@@ -13,7 +13,8 @@ pub(crate) struct Party {
     /// The participant, if each has a state of its own.
     pub(crate) peer: Option<Name>,
     pub(crate) state: StateId,
-    /// During a cancel, or after a failure or a not-understood: the state before it.
+    /// During a cancel, or after a failure or a not-understood: the state before it. After a cancel that a message
+    /// has crossed: the state after that message.
     pub(crate) resume: StateId,
     /// The state before the last message.
     pub(crate) before: StateId,
@@ -23,7 +24,7 @@ pub(crate) struct Party {
     pub(crate) canceling_side: Side,
     /// Whether the answer to the cancel may still come, because the message that was taken for it may
     /// have been sent before the cancel arrived. After an `inform`, `resume` is the state after that
-    /// message.
+    /// message. After a `not-understood`, whether a cancel that crossed it has no answer yet.
     pub(crate) echo: bool,
     /// Performative of the last message of each side.
     pub(crate) acts: [Option<ActNumber>; 2],
