@@ -485,7 +485,10 @@ fn the_side_that_canceled_may_not_understand_a_message_that_crossed_the_cancel()
         let answer = || say(act_of_ben(act)).in_reply_to("x");
         crossing(
             &opening,
-            (&[cancel.clone()], &[propose.clone()]),
+            (
+                std::slice::from_ref(&cancel),
+                std::slice::from_ref(&propose),
+            ),
             |mut stage| {
                 // The participant answers the cancel after the not-understood.
                 assert_eq!(stage.right(not_understood()), "not-understood");

@@ -98,7 +98,7 @@ impl Backlog {
     }
 
     /// The lanes to visit, in turn, if their time has come.
-    fn to_visit(&mut self, now: Instant) -> Vec<LaneId> {
+    fn visits(&mut self, now: Instant) -> Vec<LaneId> {
         if self.due().is_none_or(|due| now < due) {
             return Vec::new();
         }
@@ -180,7 +180,7 @@ impl Core {
 
     /// Visits the lanes with a backlog.
     pub(super) fn visit_backlog(&mut self, now: Now) {
-        for lane in self.backlog.to_visit(now.instant) {
+        for lane in self.backlog.visits(now.instant) {
             // Each visit of a lane relieves it.
             self.with_lane(now, lane, |_, _| {});
         }
