@@ -133,7 +133,8 @@ fn after_common_step(
             if message.act == NOT_UNDERSTOOD
                 && message.side == party.canceling_side
                 && message.side != party.last
-                && (machine.state(party.resume).is_some() || answers_protocol(party, message))
+                && (!party.echo && machine.state(party.resume).is_some()
+                    || answers_protocol(party, message))
                 && !message.own =>
         {
             Ok(NextState {

@@ -403,7 +403,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                 && asked.is_some_and(|asked| asked.reply_with == view.words.in_reply_to);
             let since = talk.said.iter().rev().take_while(|said| !said.cancels);
             if act == "not-understood"
-                && (back.is_some() || since.count() >= 2 || answers_protocol)
+                && (back.is_none() && since.count() >= 2 || answers_protocol)
                 && view.by_initiator == cancel.by_initiator
                 && view.by_initiator != talk.last_by_initiator()
                 && !view.own

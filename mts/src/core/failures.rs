@@ -115,7 +115,12 @@ impl Core {
                             count,
                         };
                         let of = from.map(|from| (from, failed));
-                        if !of.is_some_and(|of| self.summaries.add(now.instant, of, later)) {
+                        if of.is_some_and(|of| self.summaries.add(now.instant, of, later)) {
+                            log_limit::warn!(
+                                of: address.map(quota_address),
+                                "failure messages beyond a limit to one sender become one message"
+                            );
+                        } else {
                             log_omitted(address);
                         }
                         continue;
