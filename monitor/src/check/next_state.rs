@@ -133,8 +133,7 @@ fn after_common_step(
             if message.act == NOT_UNDERSTOOD
                 && message.side == party.canceling_side
                 && message.side != party.last
-                && (!party.echo && machine.state(party.resume).is_some()
-                    || answers_protocol(party, message))
+                && answers_protocol(party, message)
                 && !message.own =>
         {
             Ok(NextState {
@@ -302,7 +301,6 @@ fn after_crossing(
             },
         }),
         _ if answers => Ok(NextState {
-            resume: party.resume,
             answers_cancel: true,
             ..NextState::to(CANCELLED)
         }),
@@ -344,11 +342,6 @@ fn while_cancelling(
                 Ok(crossing) if !told_apart => NextState {
                     resume: crossing.state,
                     echo: true,
-                    ..NextState::to(CANCELLED)
-                },
-                // A message that crossed the cancel may still cause a not-understood.
-                _ if party.before == CANCELLING => NextState {
-                    resume: party.resume,
                     ..NextState::to(CANCELLED)
                 },
                 _ => NextState::to(CANCELLED),

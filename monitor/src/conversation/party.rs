@@ -13,8 +13,7 @@ pub(crate) struct Party {
     /// The participant, if each has a state of its own.
     pub(crate) peer: Option<Name>,
     pub(crate) state: StateId,
-    /// During a cancel, or after a failure or a not-understood: the state before it. After a cancel that a message
-    /// has crossed: the state after that message.
+    /// During a cancel, or after a failure or a not-understood: the state before it.
     pub(crate) resume: StateId,
     /// The state before the last message.
     pub(crate) before: StateId,

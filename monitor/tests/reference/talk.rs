@@ -401,9 +401,8 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let asked = talk.last_of(!view.by_initiator);
             let answers_protocol = view.words.in_reply_to.is_some()
                 && asked.is_some_and(|asked| asked.reply_with == view.words.in_reply_to);
-            let since = talk.said.iter().rev().take_while(|said| !said.cancels);
             if act == "not-understood"
-                && (back.is_none() && since.count() >= 2 || answers_protocol)
+                && answers_protocol
                 && view.by_initiator == cancel.by_initiator
                 && view.by_initiator != talk.last_by_initiator()
                 && !view.own
@@ -712,7 +711,7 @@ impl Talk {
             };
         }
         let cancels_late = step.void && words.act == "cancel" && step.echo && !self.echo;
-        self.echo = step.echo;
+        let echo = std::mem::replace(&mut self.echo, step.echo);
         let late =
             self.due.is_some_and(|due| due < now) && self.last_by_initiator() != by_initiator;
         if step.void {
@@ -737,6 +736,7 @@ impl Talk {
             matches!(step.spot, Spot::Cancelling(_)) && !matches!(self.spot, Spot::Cancelling(_));
         let earlier = Self {
             earlier: None,
+            echo,
             ..self.clone()
         };
         self.earlier = Some(Box::new(earlier));
