@@ -751,3 +751,191 @@ fn letters_to_an_unreachable_legacy_peer_fail_like_others() {
 fn read(core: &Core, letter: Letter, via: Kind, from: IpAddr) -> Unframed {
     Unframed::read(letter, via, legacy(from), &**core.view()).unwrap()
 }
+
+/// A letter of `cpp-sender` with this content.
+fn letter_to(receiver: &str, content: &str) -> Letter {
+    let content = content.to_owned();
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("cpp-sender").unwrap())
+        .receiver(AgentId::new(receiver).unwrap())
+        .content(content)
+        .build()
+        .unwrap();
+    letter_for(&message, now().utc).unwrap()
+}
+
+/// The directory of a host with these agents, and `cpp-sender` at its own address.
+fn host_of_all(agents: &[&str]) -> Arc<dyn Directory> {
+    let here = MemoryDirectory::new(MtsId::new("process", Incarnation::from_u64(9)));
+    for (number, agent) in (5..).zip(agents) {
+        let at = "shm://9#0000000000000009".parse().unwrap();
+        let agent = Registration::new(*agent, Incarnation::from_u64(number), vec![at]);
+        here.register(agent).unwrap();
+    }
+    let there = [("cpp-sender", vec![OLD_PEER.parse::<Location>().unwrap()])];
+    let there = StaticDirectory::new(there).unwrap();
+    Arc::new(MergedDirectory::new(vec![Arc::new(here), Arc::new(there)]))
+}
+
+fn content_of(parcel: &Parcel) -> String {
+    let content = message_of(parcel).content().unwrap().to_vec();
+    String::from_utf8(content).unwrap()
+}
+
+#[test]
+fn letters_beyond_the_share_of_a_receiver_wait_and_those_for_others_pass() {
+    const LETTERS: usize = 40_000;
+    let mut core = Core::new(
+        gateway(&[Kind::Shm, Kind::Tcp]),
+        host_of_all(&["echo", "quick"]).view(),
+    );
+    let begun = now();
+    let deadline = Duration::from_secs(60);
+    let arrives = |core: &mut Core, letter: Letter| {
+        let mut unframed = read(core, letter, Kind::Tcp, HERE);
+        core.handle_unframed(begun, deadline, &mut unframed);
+    };
+    let mut under_way = Vec::new();
+    for number in 0..LETTERS {
+        arrives(&mut core, letter_to("echo", &number.to_string()));
+        under_way.extend(std::iter::from_fn(|| dispatched(&mut core)));
+    }
+    // The receiver stands still. A letter for another agent arrives.
+    arrives(&mut core, letter_to("quick", "at once"));
+    let (attempt, _, parcel) = dispatched(&mut core).unwrap();
+    assert_eq!(content_of(&parcel), "at once");
+    core.handle_conclusion(begun, attempt, Conclusion::Answered(Answer::Accepted));
+    // The receiver goes on.
+    let mut taken = Vec::new();
+    while !under_way.is_empty() {
+        for (attempt, location, parcel) in std::mem::take(&mut under_way) {
+            assert_eq!(location.kind(), Kind::Shm, "{}", content_of(&parcel));
+            taken.push(content_of(&parcel).parse::<usize>().unwrap());
+            core.handle_conclusion(begun, attempt, Conclusion::Answered(Answer::Accepted));
+            under_way.extend(std::iter::from_fn(|| dispatched(&mut core)));
+        }
+    }
+    assert_eq!(taken, (0..LETTERS).collect::<Vec<_>>());
+    assert!(!core.has_open_letters());
+}
+
+#[test]
+fn letters_beyond_the_share_of_an_address_fail_and_those_of_another_wait() {
+    let config = CoreConfig {
+        custody_bytes: 1 << 20,
+        ..gateway(&[Kind::Shm, Kind::Tcp])
+    };
+    let mut core = Core::new(config, host_of_all(&["echo"]).view());
+    let begun = now();
+    let deadline = Duration::from_secs(60);
+    let failed_of = |core: &mut Core, address: IpAddr, letters: usize| {
+        let mut failed = Vec::new();
+        for number in 0..letters {
+            let mut unframed = read(
+                core,
+                letter_to("echo", &number.to_string()),
+                Kind::Tcp,
+                address,
+            );
+            core.handle_unframed(begun, deadline, &mut unframed);
+            while let Some((attempt, location, _)) = dispatched(core) {
+                if location.kind() == Kind::Tcp {
+                    failed.push(number);
+                    core.handle_conclusion(begun, attempt, Conclusion::Handed);
+                }
+            }
+        }
+        failed
+    };
+    // A third of the mebibyte in the lane, and a quarter of it beyond.
+    let loud = failed_of(&mut core, IpAddr::from([10, 0, 0, 3]), 1000);
+    let first = *loud.first().unwrap();
+    assert!((380..=400).contains(&first), "{first}");
+    // The sender gets a failure message for each of the first ones.
+    assert_eq!(loud, (first..first + 20).collect::<Vec<_>>());
+    let other = failed_of(&mut core, IpAddr::from([10, 0, 0, 4]), 100);
+    assert_eq!(other, Vec::<usize>::new());
+}
+
+#[test]
+fn letters_that_wait_for_a_receiver_fail_at_their_deadline() {
+    let config = CoreConfig {
+        custody_bytes: 1 << 20,
+        ..gateway(&[Kind::Shm, Kind::Tcp])
+    };
+    let mut core = Core::new(config, host_of_all(&["echo"]).view());
+    let begun = now();
+    for number in 0..300 {
+        let mut unframed = read(
+            &core,
+            letter_to("echo", &number.to_string()),
+            Kind::Tcp,
+            HERE,
+        );
+        core.handle_unframed(begun, Duration::from_secs(5), &mut unframed);
+        while let Some((_, location, _)) = dispatched(&mut core) {
+            assert_eq!(location.kind(), Kind::Shm);
+        }
+    }
+    assert!(core.has_open_letters());
+    let mut reported = Vec::new();
+    let mut time = begun;
+    while core.has_open_letters() {
+        time.instant = core.poll_timeout().unwrap().max(time.instant);
+        core.handle_timeout(time);
+        while let Some(action) = core.poll_action() {
+            match action {
+                Action::Dispatch {
+                    attempt,
+                    location,
+                    parcel,
+                } if location.kind() == Kind::Tcp => {
+                    let failure = message_of(&parcel);
+                    reported.push(nested(failure.content().unwrap()));
+                    core.handle_conclusion(time, attempt, Conclusion::Handed);
+                }
+                Action::Abandon { attempt, error, .. } => {
+                    core.handle_conclusion(time, attempt, Conclusion::NotSent(error));
+                }
+                Action::Refresh { number } => core.handle_refreshed(time, number),
+                _ => {}
+            }
+        }
+        assert!(time.instant < begun.instant + Duration::from_secs(60));
+    }
+    assert!(reported.len() >= 20);
+}
+
+#[test]
+fn failure_messages_beyond_the_rate_of_a_sender_are_one_summary() {
+    const LETTERS: usize = 500;
+    let mut core = core(true, &[("cpp-sender", OLD_PEER)]);
+    let begun = now();
+    let mut reported = Vec::new();
+    for number in 0..LETTERS {
+        let letter = letter_to("absent", &number.to_string());
+        let mut unframed = read(&core, letter, Kind::Tcp, HERE);
+        core.handle_unframed(begun, Duration::from_secs(5), &mut unframed);
+        while let Some((attempt, _, parcel)) = dispatched(&mut core) {
+            reported.push(content_of(&parcel));
+            core.handle_conclusion(begun, attempt, Conclusion::Handed);
+        }
+    }
+    assert_eq!(reported.len(), 20);
+    assert!(!reported[19].contains("more letters"), "{}", reported[19]);
+    let later = Now {
+        instant: core.poll_timeout().unwrap(),
+        ..begun
+    };
+    assert!(later.instant <= begun.instant + Duration::from_secs(1));
+    core.handle_timeout(later);
+    let (attempt, _, parcel) = dispatched(&mut core).unwrap();
+    let text = content_of(&parcel);
+    let expected = format!(
+        "no such agent (and {} more letters were not delivered)",
+        LETTERS - 21
+    );
+    assert!(text.contains(&expected), "{text}");
+    core.handle_conclusion(later, attempt, Conclusion::Handed);
+    assert!(dispatched(&mut core).is_none());
+}

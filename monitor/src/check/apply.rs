@@ -13,7 +13,7 @@ use crate::conversation::ids::PartyIndex;
 use crate::conversation::names::Names;
 use crate::conversation::party::{Party, Side, side_index};
 use crate::conversation::state::{CANCELLING, FAILED};
-use crate::protocol::act::ActNumber;
+use crate::protocol::act::{ActNumber, CANCEL};
 use crate::protocol::index::StateId;
 use crate::protocol::machine::{After, Machine, Scope};
 use crate::protocol::role::{MessageRoles, Role, RoleSet};
@@ -147,6 +147,10 @@ impl Change<'_> {
         self.late |= party.deadline != 0 && party.deadline < self.now && answers;
         let cancels = next_state.state == CANCELLING && party.state != CANCELLING;
         if next_state.void {
+            if self.observed.act == CANCEL && next_state.echo && !party.echo {
+                party.canceling_side = side;
+                party.set_cancel(self.observed.reply_with);
+            }
             (party.state, party.resume, party.echo) =
                 (next_state.state, next_state.resume, next_state.echo);
             self.state = self.state.or(Some(party.state));

@@ -127,18 +127,24 @@ fn after_common_step(
         CANCELLED if party.echo && message.side != party.canceling_side => {
             after_crossing(machine, party, message)
         }
-        // A message that was sent before the not-understood arrived changes nothing.
-        AFTER_NOT_UNDERSTOOD if !message.own && message.side != party.last => {
-            match in_state(machine, party, party.resume, message) {
-                Ok(NextState { state, .. }) => Ok(NextState {
-                    resume: machine.state(state).map_or(party.resume, |_| state),
-                    void: true,
-                    ..NextState::to(AFTER_NOT_UNDERSTOOD)
-                }),
-                Err(_) => Err(ended(party, message)),
-            }
+        // The side that canceled has not understood a message that crossed the cancel, and has not received
+        // the answer to the cancel yet.
+        CANCELLED
+            if message.act == NOT_UNDERSTOOD
+                && message.side == party.canceling_side
+                && message.side != party.last
+                && answers_protocol(party, message)
+                && !message.own =>
+        {
+            Ok(NextState {
+                resume: party.resume,
+                echo: party.echo,
+                void: true,
+                ..NextState::to(CANCELLED)
+            })
         }
-        AFTER_NOT_UNDERSTOOD | CANCELLED => Err(ended(party, message)),
+        CANCELLED => Err(ended(party, message)),
+        AFTER_NOT_UNDERSTOOD => after_not_understood(machine, party, message),
         // A message that was reported as failed may have arrived, or is sent again.
         FAILED if let Some(worlds) = party.worlds() => in_worlds(machine, party, worlds, message),
         FAILED => {
@@ -218,9 +224,49 @@ fn is_cancel_answer(message: &PartyMessage<'_>) -> bool {
     [INFORM, FAILURE, NOT_UNDERSTOOD].contains(&message.act)
 }
 
+/// Whether a message names the last message of the other side that is a step of the protocol.
+fn answers_protocol(party: &Party, message: &PartyMessage<'_>) -> bool {
+    let asked = party.asked[side_index(message.side.opposite())];
+    message.in_reply_to != 0 && message.in_reply_to == asked
+}
+
 /// Whether `in-reply-to` distinguishes the answer to a cancel from other messages.
 fn is_told_apart(party: &Party, message: &PartyMessage<'_>) -> bool {
     message.in_reply_to != 0 && party.cancel() != 0
+}
+
+/// Returns the state after a message that follows a not-understood. One that was sent before the
+/// not-understood arrived changes nothing. A cancel that has crossed it is answered nevertheless.
+fn after_not_understood(
+    machine: &Machine,
+    party: &Party,
+    message: &PartyMessage<'_>,
+) -> Result<NextState, Kind> {
+    let crossing = match !message.own && message.side != party.last {
+        true => in_state(machine, party, party.resume, message),
+        false => Err(ended(party, message)),
+    };
+    let told_apart = is_told_apart(party, message);
+    let answers = party.echo
+        && message.side != party.canceling_side
+        && is_cancel_answer(message)
+        && (!told_apart || message.in_reply_to == party.cancel());
+    let after = NextState::to(AFTER_NOT_UNDERSTOOD);
+    match crossing {
+        crossing if answers => Ok(NextState {
+            resume: party.resume,
+            echo: !told_apart && crossing.is_ok(),
+            answers_cancel: true,
+            ..after
+        }),
+        Ok(NextState { state, .. }) => Ok(NextState {
+            resume: machine.state(state).map_or(party.resume, |_| state),
+            echo: party.echo || state == CANCELLING,
+            void: true,
+            ..after
+        }),
+        Err(_) => Err(ended(party, message)),
+    }
 }
 
 /// Returns the state after a message of the canceled side. The message that was taken for the answer to
@@ -278,7 +324,11 @@ fn while_cancelling(
     let group = machine.scope == Scope::Conversation;
     if message.side == party.canceling_side && !group {
         return match message.act {
-            NOT_UNDERSTOOD => Ok(NextState::not_understood_in(party.resume)),
+            // The cancel is still to be answered.
+            NOT_UNDERSTOOD => Ok(NextState {
+                echo: true,
+                ..NextState::not_understood_in(party.resume)
+            }),
             _ if is_repeated(party, message) => Err(Kind::Repeated),
             _ => Err(Kind::Unexpected),
         };
@@ -301,7 +351,10 @@ fn while_cancelling(
                 echo: !told_apart && crossing.is_ok(),
                 ..NextState::to(party.resume)
             },
-            _ => NextState::not_understood_in(party.resume),
+            _ => NextState {
+                echo: !told_apart && crossing.is_ok(),
+                ..NextState::not_understood_in(party.resume)
+            },
         };
         return Ok(NextState {
             answers_cancel: true,
@@ -310,7 +363,11 @@ fn while_cancelling(
     }
     // If the cancel fails, the conversation continues in the state after the crossing message.
     crossing.map(|next_state| match next_state.state {
-        AFTER_NOT_UNDERSTOOD => next_state,
+        // The answer to the cancel follows.
+        AFTER_NOT_UNDERSTOOD => NextState {
+            echo: true,
+            ..next_state
+        },
         _ => NextState {
             state: CANCELLING,
             crossed: true,

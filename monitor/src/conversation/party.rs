@@ -23,7 +23,7 @@ pub(crate) struct Party {
     pub(crate) canceling_side: Side,
     /// Whether the answer to the cancel may still come, because the message that was taken for it may
     /// have been sent before the cancel arrived. After an `inform`, `resume` is the state after that
-    /// message.
+    /// message. After a `not-understood`, whether a cancel that crossed it has no answer yet.
     pub(crate) echo: bool,
     /// Performative of the last message of each side.
     pub(crate) acts: [Option<ActNumber>; 2],

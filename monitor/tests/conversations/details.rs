@@ -414,7 +414,140 @@ fn not_understood_during_a_cancel_ends_the_conversation() {
     stage.right(request("cancel ann>ben").reply_with("x"));
     let crossing = request("not-understood ben>ann").in_reply_to("q");
     assert_eq!(stage.right(crossing), "not-understood");
-    assert_eq!(stage.wrong(request("inform ben>ann")).kind, Kind::Ended);
+    let result = request("inform ben>ann").in_reply_to("q");
+    assert_eq!(stage.wrong(result).kind, Kind::Ended);
+}
+
+/// The messages in the order in which each agent, and a monitor of all, sends or receives them: the messages of
+/// `first` cross those of `second`, which the other agent sends.
+fn crossing(
+    opening: &[Header<'static>],
+    (ann, ben): (&[Header<'static>], &[Header<'static>]),
+    mut check: impl FnMut(Stage),
+) {
+    for (name, is_ann_first) in [
+        (None, true),
+        (None, false),
+        (Some("ann"), true),
+        (Some("ben"), false),
+    ] {
+        let mut stage = Stage::new(match name {
+            None => Monitor::observer(library()),
+            Some(name) => Monitor::agent(library(), name),
+        });
+        let (first, second) = match is_ann_first {
+            true => (ann, ben),
+            false => (ben, ann),
+        };
+        for message in opening.iter().chain(first).chain(second) {
+            stage.right(message.clone());
+        }
+        check(stage);
+    }
+}
+
+#[test]
+fn a_cancel_that_crosses_a_not_understood_is_answered() {
+    for act in ["failure", "inform", "not-understood"] {
+        for told_apart in [true, false] {
+            let opening = [request("request ann>ben").reply_with("q")];
+            let cancel = [request("cancel ann>ben").reply_with("x")];
+            let not_understood = [request("not-understood ben>ann").in_reply_to("q")];
+            crossing(&opening, (&cancel, &not_understood), |mut stage| {
+                let answer = say_in("fipa-request", act_of_ben(act));
+                let answer = match told_apart {
+                    true => answer.in_reply_to("x"),
+                    false => answer,
+                };
+                assert_eq!(stage.right(answer), "not-understood");
+                let result = request("inform ben>ann").in_reply_to("x");
+                assert_eq!(stage.wrong(result).kind, Kind::Ended);
+            });
+        }
+    }
+}
+
+fn act_of_ben(act: &str) -> &'static str {
+    match act {
+        "failure" => "failure ben>ann",
+        "inform" => "inform ben>ann",
+        _ => "not-understood ben>ann",
+    }
+}
+
+#[test]
+fn the_side_that_canceled_may_not_understand_a_message_that_crossed_the_cancel() {
+    let opening = [say("cfp ann>ben").reply_with("q")];
+    let cancel = say("cancel ann>ben").reply_with("x");
+    let propose = say("propose ben>ann").in_reply_to("q").reply_with("p");
+    let not_understood = || say("not-understood ann>ben").in_reply_to("p");
+    for act in ["failure", "inform", "not-understood"] {
+        let answer = || say(act_of_ben(act)).in_reply_to("x");
+        crossing(
+            &opening,
+            (
+                std::slice::from_ref(&cancel),
+                std::slice::from_ref(&propose),
+            ),
+            |mut stage| {
+                // The participant answers the cancel after the not-understood.
+                assert_eq!(stage.right(not_understood()), "not-understood");
+                assert_eq!(stage.right(answer()), "not-understood");
+            },
+        );
+        // The participant has answered the cancel before. The initiator has not received the answer.
+        let answered = [propose.clone(), cancel.clone(), answer()];
+        let all = Stage::observer();
+        let ben = Stage::new(Monitor::agent(library(), "ben"));
+        for mut stage in [all, ben] {
+            stage.right(opening[0].clone());
+            for message in &answered {
+                stage.right(message.clone());
+            }
+            let state = stage.right(not_understood());
+            let expected = match act {
+                "inform" => "cancelled",
+                _ => "not-understood",
+            };
+            assert_eq!(state, expected, "{act}");
+        }
+    }
+}
+
+#[test]
+fn a_participant_that_canceled_may_not_understand_a_message_that_crossed_the_cancel() {
+    let text = r#"<scxml initial="1" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant" fipa:cancel="anyone">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="query-if" from="a" to="b" target="3"/></state>
+        <state id="3"><transition performative="agree" from="b" to="a" target="4"/></state>
+        <state id="4" final="yes"/></scxml>"#;
+    for act in ["failure", "inform", "not-understood"] {
+        for name in [None, Some("ann"), Some("ben")] {
+            let library = library_with("own", text);
+            let mut stage = Stage::new(match name {
+                None => Monitor::observer(library),
+                Some(name) => Monitor::agent(library, name),
+            });
+            stage.right(own("request ann>ben").reply_with("q"));
+            let cancel = own("cancel ben>ann").reply_with("x");
+            let query = own("query-if ann>ben").reply_with("r");
+            let both = match name {
+                Some("ann") => [query, cancel],
+                _ => [cancel, query],
+            };
+            for message in both {
+                stage.right(message);
+            }
+            let not_understood = own("not-understood ben>ann").in_reply_to("r");
+            assert_eq!(stage.right(not_understood), "not-understood");
+            let answer = match act {
+                "failure" => "failure ann>ben",
+                "inform" => "inform ann>ben",
+                _ => "not-understood ann>ben",
+            };
+            assert_eq!(stage.right(own(answer).in_reply_to("x")), "not-understood");
+        }
+    }
 }
 
 #[test]

@@ -26,7 +26,8 @@ pub(super) struct Talk {
     pub(super) previous: Spot,
     pub(super) said: Vec<SentMessage>,
     pub(super) due: Option<u64>,
-    /// Whether a failure that may have crossed a cancel was taken for the answer to it.
+    /// Whether a failure that may have crossed a cancel was taken for the answer to it. After a
+    /// not-understood: whether a cancel has no answer yet.
     pub(super) echo: bool,
     /// The talk before its last message, until that one fails.
     earlier: Option<Box<Talk>>,
@@ -362,17 +363,33 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
         }
         Spot::Elsewhere => Err("unexpected"),
         Spot::NotUnderstood(back) => {
-            let last = talk.said.last().expect("a not-understood was sent");
-            if !view.own
-                && last.by_initiator != view.by_initiator
-                && let Ok(step) = judge_at(machine, talk, back, view)
+            let is_later = view.own || talk.last_by_initiator() == view.by_initiator;
+            let on_its_way = match is_later {
+                true => Err("ended"),
+                false => judge_at(machine, talk, back, view),
+            };
+            if let Some(cancel) = talk.cancel().filter(|_| talk.echo)
+                && cancel.by_initiator != view.by_initiator
+                && answers_cancel
             {
+                let both = cancel.reply_with.is_some() && view.words.in_reply_to.is_some();
+                if !both || cancel.reply_with == view.words.in_reply_to {
+                    return Ok(Step {
+                        echo: !both && on_its_way.is_ok(),
+                        answers_cancel: true,
+                        ..to(talk.spot.clone())
+                    });
+                }
+            }
+            if let Ok(step) = on_its_way {
+                let cancels = matches!(step.spot, Spot::Cancelling(_));
                 let back = match step.spot {
                     Spot::At(id) => id,
                     _ => back.clone(),
                 };
                 return Ok(Step {
                     void: true,
+                    echo: talk.echo || cancels,
                     ..to(Spot::NotUnderstood(back))
                 });
             }
@@ -381,6 +398,21 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
         Spot::Cancelled(back) => {
             let wrong = Err(if repeated { "repeated" } else { "ended" });
             let cancel = talk.cancel().expect("a cancel was sent");
+            let asked = talk.last_of(!view.by_initiator);
+            let answers_protocol = view.words.in_reply_to.is_some()
+                && asked.is_some_and(|asked| asked.reply_with == view.words.in_reply_to);
+            if act == "not-understood"
+                && answers_protocol
+                && view.by_initiator == cancel.by_initiator
+                && view.by_initiator != talk.last_by_initiator()
+                && !view.own
+            {
+                return Ok(Step {
+                    void: true,
+                    echo: talk.echo,
+                    ..to(talk.spot.clone())
+                });
+            }
             let Some(back) = back else { return wrong };
             if view.by_initiator == cancel.by_initiator {
                 return wrong;
@@ -416,7 +448,10 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let cancel = talk.cancel().expect("a cancel was sent");
             if machine.scope() == Scope::Participant && view.by_initiator == cancel.by_initiator {
                 return match act {
-                    "not-understood" => Ok(to(Spot::NotUnderstood(back.clone()))),
+                    "not-understood" => Ok(Step {
+                        echo: true,
+                        ..to(Spot::NotUnderstood(back.clone()))
+                    }),
                     _ if repeated => Err("repeated"),
                     _ => Err("unexpected"),
                 };
@@ -424,7 +459,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             let both = cancel.reply_with.is_some() && view.words.in_reply_to.is_some();
             let on_its_way = judge_at(machine, talk, back, view);
             if answers_cancel && (!both || cancel.reply_with == view.words.in_reply_to) {
-                let echo = act == "failure" && !both && on_its_way.is_ok();
+                let echo = act != "inform" && !both && on_its_way.is_ok();
                 let next = to(match act {
                     "inform" => Spot::Cancelled(match on_its_way {
                         Ok(Step {
@@ -457,6 +492,11 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                 Spot::Undelivered(_) => Step {
                     crossed: true,
                     ..to(talk.spot.clone())
+                },
+                // The answer to the cancel follows.
+                Spot::NotUnderstood(back) => Step {
+                    echo: true,
+                    ..to(Spot::NotUnderstood(back))
                 },
                 other => to(other),
             })
@@ -670,11 +710,22 @@ impl Talk {
                 ..talks[world].clone()
             };
         }
-        self.echo = step.echo;
+        let cancels_late = step.void && words.act == "cancel" && step.echo && !self.echo;
+        let echo = std::mem::replace(&mut self.echo, step.echo);
         let late =
             self.due.is_some_and(|due| due < now) && self.last_by_initiator() != by_initiator;
         if step.void {
             self.spot = step.spot;
+            if cancels_late {
+                self.said.push(SentMessage {
+                    by_initiator,
+                    act: words.act,
+                    reply_with: words.reply_with.clone(),
+                    cancels: true,
+                    crossed: true,
+                    answers_cancel: false,
+                });
+            }
             return (opened, true);
         }
         if let Spot::Undelivered(_) = &step.spot {
@@ -685,6 +736,7 @@ impl Talk {
             matches!(step.spot, Spot::Cancelling(_)) && !matches!(self.spot, Spot::Cancelling(_));
         let earlier = Self {
             earlier: None,
+            echo,
             ..self.clone()
         };
         self.earlier = Some(Box::new(earlier));

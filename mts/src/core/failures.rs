@@ -79,6 +79,7 @@ impl Core {
             letter,
             reason: FailureReason::Refused,
             detail: why,
+            count: 1,
         });
         self.send_failures(now);
     }
@@ -92,6 +93,7 @@ impl Core {
                 letter,
                 reason,
                 detail,
+                count,
             } = undelivered;
             let name = Arc::clone(&self.table.config.name);
             let name = &*name;
@@ -104,6 +106,23 @@ impl Core {
                 FailureTarget::LegacyPeer { failed, .. } | FailureTarget::Remote(failed) => {
                     let named = failed.sender.name();
                     if !self.failure_limit.allows(now.instant, address, named) {
+                        let later = Undelivered {
+                            sender: sender.clone(),
+                            receiver,
+                            letter,
+                            reason,
+                            detail,
+                            count,
+                        };
+                        let of = from.map(|from| (from, failed));
+                        if of.is_some_and(|of| self.summaries.add(now.instant, of, later)) {
+                            log_limit::warn!(
+                                of: address.map(quota_address),
+                                "failure messages beyond a limit to one sender become one message"
+                            );
+                        } else {
+                            log_omitted(address);
+                        }
                         continue;
                     }
                     // Failure messages are encoded only in proportion to the received bytes.
@@ -122,6 +141,7 @@ impl Core {
                 receiver: &receiver,
                 reason,
                 detail: &detail,
+                count,
             };
             let own = self.table.config.incarnation;
             let sequence = self.sequence_of(own);

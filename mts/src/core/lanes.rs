@@ -78,6 +78,12 @@ impl Core {
             return;
         };
         work(lane, &mut self.table);
+        if self.backlog.has_any_of(id) {
+            self.relieve(now, id);
+        }
+        let Some(lane) = self.lanes.get_mut(&id) else {
+            return;
+        };
         if let Some(due) = lane.due()
             && lane.scheduled.is_none_or(|scheduled| due < scheduled)
         {
@@ -124,7 +130,8 @@ impl Core {
             return;
         };
         let quiet = now.instant.saturating_duration_since(lane.active) > memory;
-        if lane.is_idle() && (quiet || !lane.remembers()) {
+        let is_awaited = self.backlog.has_any_of(id);
+        if lane.is_idle() && !is_awaited && (quiet || !lane.remembers()) {
             self.lane_ids.remove(lane.key());
             self.lanes.remove(&id);
             self.lane_order.remove(&id);

@@ -174,13 +174,9 @@ impl Default for FailureLimit {
 }
 
 impl FailureLimit {
-    /// Whether another failure message may be sent to this sender; otherwise logs it as omitted.
+    /// Whether another failure message may be sent to this sender.
     pub(super) fn allows(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
-        let allowed = self.limit.take(now, from, sender);
-        if !allowed {
-            log_omitted(from);
-        }
-        allowed
+        self.limit.take(now, from, sender)
     }
 
     /// Credits the bytes of a letter from a legacy peer at this address, at least [`MIN_CREDIT`].

@@ -19,6 +19,7 @@
 //!   visits and drops lanes, `passes` divides visits of all lanes into portions.
 //! * `routes`: the choice of the location that it goes to, and the failures of locations.
 //! * `forward`: a gateway takes it into custody, as far as `lane_budget` has room.
+//! * `backlog`: a letter of a legacy peer waits there while the lane of its receiver is full.
 //! * `inbox`: it is accepted once and in order into an agent's queue.
 //! * `settlement`: its sender, or the services that handed it over, are told its end.
 //!
@@ -29,7 +30,7 @@
 //! * `label`, `origin`, `tally`, `undelivered`: values that the others pass on.
 //! * `action`: the actions for the runtime.
 //! * `notes`: reports, credits and predecessors, which are repeated or wait for room.
-//! * `failures`: failure messages to senders; `limits`: their rate limits.
+//! * `failures`: failure messages to senders; `limits`: their rate limits; `summaries`: those beyond them.
 //! * `principals`: the identities that services and senders have proved.
 //! * `contacts`: agents that become known by their letters.
 //! * `peers`: services in the configuration, and the state of contact with them.
@@ -48,6 +49,7 @@
 
 mod action;
 mod arrival;
+mod backlog;
 mod config;
 mod contacts;
 mod custody;
@@ -75,6 +77,7 @@ mod routes;
 pub mod rules;
 mod settlement;
 mod submit;
+mod summaries;
 mod tally;
 mod undelivered;
 mod unframed;
@@ -95,6 +98,7 @@ use fipa_transport::counts::{Event, SharedCounts};
 use fipa_transport::{AttemptId, Conclusion, FailureReason, Incarnation, Kind};
 
 pub use self::action::Action;
+use self::backlog::Backlog;
 pub use self::config::{CoreConfig, MAX_DEADLINE, RouteException};
 pub use self::failures::Undecodable;
 pub use self::ids::SubmissionId;
@@ -112,7 +116,9 @@ use self::principals::Principals;
 pub use self::reading::{LetterReader, ReadLetter};
 pub use self::route_report::{Route, RouteCandidate, RouteState, Standing};
 pub use self::submit::Submission;
+use self::summaries::Summaries;
 pub use self::unframed::Unframed;
+use self::unframed::failed_for;
 use self::waiting::{Unresolved, WaitingLetters};
 pub use self::watch_event::{News, Notice};
 use crate::{AccessGate, Map};
@@ -149,6 +155,8 @@ pub struct Core {
     agents: Map<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
     waiting: WaitingLetters,
+    backlog: Backlog,
+    summaries: Summaries,
     /// Letters to coalitions that have no leader at present, each with one receiver.
     leaderless: WaitingLetters,
     static_peers: Peers,
@@ -199,6 +207,8 @@ impl Core {
             agents: Map::default(),
             timers: BinaryHeap::new(),
             waiting: WaitingLetters::default(),
+            backlog: Backlog::default(),
+            summaries: Summaries::default(),
             leaderless: WaitingLetters::default(),
             static_peers: Peers::default(),
             principals: Principals::default(),
@@ -377,6 +387,8 @@ impl Core {
             self.with_lane(now, id, |lane, table| lane.dispatch_all(now.instant, table));
         }
         self.visit_lanes(now);
+        self.visit_backlog(now);
+        self.summarize(now);
         let is_late = |letter: &Unresolved| letter.deadline <= now.instant;
         self.fail_waiting(is_late, FailureReason::TimedOut);
         self.handle_note_timers(now);
@@ -408,7 +420,9 @@ impl Core {
         let notes = self.table.notes.due();
         let others = earlier(self.static_peers.due(), self.passes.due());
         let unresolved = earlier(self.waiting.due(), self.leaderless.due());
-        earlier(earlier(lanes, notes), earlier(others, unresolved))
+        let legacy = earlier(self.backlog.due(), self.summaries.due());
+        let others = earlier(earlier(others, unresolved), legacy);
+        earlier(earlier(lanes, notes), others)
     }
 
     /// Returns the next action to perform.
@@ -420,7 +434,7 @@ impl Core {
     #[must_use]
     pub fn has_open_letters(&self) -> bool {
         let unresolved = !self.waiting.is_empty() || !self.leaderless.is_empty();
-        unresolved || self.lanes.values().any(|lane| !lane.is_empty())
+        unresolved || !self.backlog.is_empty() || self.lanes.values().any(|lane| !lane.is_empty())
     }
 
     /// Whether the end of a letter in custody was reported, and the service that handed it over has
@@ -438,6 +452,7 @@ impl Core {
         self.closed = true;
         self.ending = true;
         self.fail_waiting(|_| true, FailureReason::Closed);
+        self.backlog.clear();
         for id in self.lanes_in_order() {
             if let Some(lane) = self.lanes.get_mut(&id) {
                 lane.give_up(now.instant, &mut self.table);

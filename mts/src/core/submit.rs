@@ -428,6 +428,7 @@ impl Core {
             letter,
             reason,
             detail,
+            count: 1,
         });
         self.table.actions.push_back(Action::Outcome {
             submission,

@@ -29,4 +29,6 @@ pub(crate) struct Undelivered {
     pub(crate) letter: Letter,
     pub(crate) reason: FailureReason,
     pub(crate) detail: String,
+    /// Number of the sender's letters that one message reports.
+    pub(crate) count: usize,
 }

@@ -394,26 +394,16 @@ impl Core {
                 letter: letter.clone(),
             });
         let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
-        let room = self.lanes.get(&lane);
-        if !room.is_some_and(|lane| lane.has_room_for_legacy(letter.len(), &self.table)) {
-            let reason = FailureReason::QueueFull;
-            self.unframed_undelivered(&entry.name, unframed, (reason, String::new()));
-            self.table
-                .notice(stream, sequence, &entry.name, || News::Settled {
-                    outcome: failed_for(reason),
-                    sender: true,
-                });
-            return;
-        }
         let until = now.instant + deadline.min(MAX_DEADLINE);
         let failed = failed.clone();
         if *is_contact {
             self.await_publication(lane);
         }
+        let address = from.address;
         let origin = Origin::LegacyPeer { from, failed };
         let letter_of = (stream.receiver, sequence);
         let open_letter = OpenLetter::new(now.instant, origin, letter.clone(), letter_of, until);
-        self.put(now, lane, open_letter);
+        self.put_unframed(now, lane, open_letter, address);
     }
 
     /// Reports that a legacy peer's letter cannot be delivered to this receiver.
@@ -457,11 +447,12 @@ impl Core {
             letter: unframed.letter.clone(),
             reason,
             detail,
+            count: 1,
         });
     }
 }
 
-fn failed_for(reason: FailureReason) -> Outcome {
+pub(super) fn failed_for(reason: FailureReason) -> Outcome {
     Outcome::Failed {
         reason,
         attempts: Vec::new(),

@@ -90,6 +90,8 @@ pub(crate) struct Failure<'a> {
     pub(crate) receiver: &'a str,
     pub(crate) reason: FailureReason,
     pub(crate) detail: &'a str,
+    /// Number of the sender's letters that failed, also to other receivers and for other reasons.
+    pub(crate) count: usize,
 }
 
 impl Failure<'_> {
@@ -138,11 +140,15 @@ impl Failure<'_> {
         )
     }
 
-    /// The reason, and its detail if there is one.
+    /// The reason, its detail if there is one, and the number of letters if the message is about several.
     fn text(&self) -> String {
-        match self.detail {
+        let text = match self.detail {
             "" => self.reason.to_string(),
             detail => format!("{}: {detail}", self.reason),
+        };
+        match self.count {
+            0 | 1 => text,
+            count => format!("{text} (and {} more letters were not delivered)", count - 1),
         }
     }
 

@@ -174,6 +174,7 @@ mod tests {
         let letter = letter_for(&request, SystemTime::UNIX_EPOCH).unwrap();
         let detail = "said \"no\"";
         let failure = Failure {
+            count: 1,
             letter: &Failed::of(&letter).unwrap(),
             receiver: "arm",
             reason: FailureReason::Refused,

@@ -204,6 +204,10 @@ impl Lane {
         self.sender
     }
 
+    pub(crate) fn receiver(&self) -> Arc<str> {
+        Arc::clone(&self.receiver)
+    }
+
     pub(crate) fn is_empty(&self) -> bool {
         self.letters.is_empty()
     }
@@ -222,7 +226,7 @@ impl Lane {
         matches!(self.key, LaneKey::Custody(_))
     }
 
-    fn stream_of(&self, open_letter: &OpenLetter) -> Stream {
+    pub(crate) fn stream_of(&self, open_letter: &OpenLetter) -> Stream {
         let realm = match self.key {
             LaneKey::Custody(stream) => stream.realm,
             LaneKey::Name(..) | LaneKey::Service(_) => Realm::UNPROVED,
@@ -756,6 +760,7 @@ impl Lane {
                 letter: open_letter.letter.clone(),
                 reason,
                 detail,
+                count: 1,
             });
         }
         let outcome = Outcome::Failed { reason, attempts };
