@@ -670,7 +670,7 @@ fn clients_send_messages_only_with_control_and_as_an_agent_of_the_host() {
     assert_no_messages(&browser);
 }
 
-/// Time of the soak, in minutes.
+/// Time of the soak in minutes, unless `FIPA_SOAK` has another number.
 const SOAK: u64 = 10;
 
 /// Number of agents of the soak.
@@ -741,6 +741,7 @@ fn soak() {
             }
         }
     });
+    println!("http://{}/#token={}", shown.address, shown.token);
     let browser = shown.open("soak", 1280, 800).unwrap();
     browser.wait_for("agent_0999");
     browser.value(
@@ -750,7 +751,8 @@ fn soak() {
     let pid = shown.gateway.pid();
     let (started, before) = (std::time::Instant::now(), processor_time(&pid));
     let mut first = None;
-    for minute in 1..=SOAK {
+    let minutes = std::env::var("FIPA_SOAK").map_or(SOAK, |minutes| minutes.parse().unwrap());
+    for minute in 1..=minutes {
         std::thread::sleep(Duration::from_secs(60));
         let heap = heap(&browser);
         let first = *first.get_or_insert(heap);
