@@ -743,7 +743,10 @@ fn soak() {
     });
     println!("http://{}/#token={}", shown.address, shown.token);
     let browser = shown.open("soak", 1280, 800).unwrap();
-    browser.wait_for("agent_0999");
+    // The browser lays out only rows in sight: the others are no text that the page shows.
+    until("all agents", || {
+        browser.value("document.body.textContent.includes('agent_0999')") == true
+    });
     browser.value(
         "(() => { window.long = []; new PerformanceObserver((list) => \
          list.getEntries().forEach((entry) => window.long.push(entry.duration))).observe({ type: 'longtask' }); })()",

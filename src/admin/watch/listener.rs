@@ -114,7 +114,7 @@ async fn forward(
         };
         loop {
             let mut records = Vec::new();
-            let read = read_batch(&socket, &mut buffer, &mut records);
+            let read = take_records(&socket, &mut buffer, &mut records);
             let (is_idle, is_full) = (records.is_empty(), records.len() >= MAX_BATCH);
             if !is_idle {
                 send(ProcessEvent::Records(source, records)).await?;
@@ -141,8 +141,8 @@ enum Batch {
     Malformed(RecordError),
 }
 
-/// Reads the records that are there, up to the maximum of a batch.
-fn read_batch(socket: &UnixDatagram, buffer: &mut [u8], records: &mut Vec<Record>) -> Batch {
+/// Takes the records that are there, up to the maximum of a batch.
+fn take_records(socket: &UnixDatagram, buffer: &mut [u8], records: &mut Vec<Record>) -> Batch {
     while records.len() < MAX_BATCH {
         let bytes = match socket.recv(buffer) {
             // Records are never empty, so an empty one is the end of the connection.
