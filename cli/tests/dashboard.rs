@@ -725,7 +725,7 @@ fn config_of(host: &Host) -> fipa::Config {
     config
 }
 
-/// Time of the soak, in minutes.
+/// Time of the soak in minutes, unless `FIPA_SOAK` has another number.
 const SOAK: u64 = 10;
 
 /// Number of agents of the soak.
@@ -793,8 +793,12 @@ fn soak() {
             }
         }
     });
+    println!("http://{}/#token={}", shown.address, shown.token);
     let browser = shown.open("soak", 1280, 800).unwrap();
-    browser.wait_for("agent_0999");
+    // The browser lays out only rows in sight: the others are no text that the page shows.
+    until("all agents", || {
+        browser.value("document.body.textContent.includes('agent_0999')") == true
+    });
     browser.value(
         "(() => { window.long = []; new PerformanceObserver((list) => \
          list.getEntries().forEach((entry) => window.long.push(entry.duration))).observe({ type: 'longtask' }); })()",
@@ -802,7 +806,8 @@ fn soak() {
     let pid = shown.gateway.pid();
     let (started, before) = (std::time::Instant::now(), processor_time(&pid));
     let mut first = None;
-    for minute in 1..=SOAK {
+    let minutes = std::env::var("FIPA_SOAK").map_or(SOAK, |minutes| minutes.parse().unwrap());
+    for minute in 1..=minutes {
         std::thread::sleep(Duration::from_secs(60));
         let heap = heap(&browser);
         let first = *first.get_or_insert(heap);

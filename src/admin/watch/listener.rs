@@ -1,5 +1,10 @@
 //! The watcher's side of the connections: accepts processes and receives their records.
+//!
+//! Records arrive in batches. While a process sends, its socket is read at intervals and is not registered with the
+//! runtime, which the kernel would wake for every single record.
 
+use std::io::ErrorKind;
+use std::os::unix::net::UnixDatagram;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -15,13 +20,19 @@ use super::socket;
 /// An event on the connection of a process.
 pub(super) enum ProcessEvent {
     Begin(RecordSource, String),
-    Record(RecordSource, Record),
+    /// Records in the order of their arrival.
+    Records(RecordSource, Vec<Record>),
     Malformed(RecordSource, RecordError),
     End(RecordSource),
 }
 
 /// Maximum number of connected processes.
 const MAX_PROCESSES: usize = 1024;
+/// Maximum number of records in one event.
+const MAX_BATCH: usize = 256;
+/// Time between two looks into the socket of a process that sends. The socket has room for the records of many
+/// thousands of letters a second during this time.
+const INTERVAL: Duration = Duration::from_millis(10);
 
 /// Accepts processes and forwards their events, until it is aborted.
 pub(super) async fn run(
@@ -79,26 +90,72 @@ async fn listen(
     {
         return;
     }
+    let _ = forward(process, source, &events).await;
+}
+
+/// The watcher was dropped.
+struct Dropped;
+
+/// Forwards the records of a process until its connection ends.
+async fn forward(
+    process: tokio::net::UnixDatagram,
+    source: RecordSource,
+    events: &mpsc::Sender<ProcessEvent>,
+) -> Result<(), Dropped> {
+    let send = async |event| events.send(event).await.map_err(|_| Dropped);
     let mut buffer = vec![0; MAX_LEN + 1];
+    let mut process = process;
     loop {
-        let end = match process.recv(&mut buffer).await {
-            // Records are never empty, so an empty one is the end of the connection.
-            Ok(0) | Err(_) => ProcessEvent::End(source),
-            Ok(len) => match Record::parse(&Bytes::copy_from_slice(&buffer[..len])) {
-                Ok(record) => {
-                    if events
-                        .send(ProcessEvent::Record(source, record))
-                        .await
-                        .is_err()
-                    {
-                        return;
-                    }
-                    continue;
-                }
-                Err(why) => ProcessEvent::Malformed(source, why),
-            },
+        if process.readable().await.is_err() {
+            return send(ProcessEvent::End(source)).await;
+        }
+        let Ok(socket) = process.into_std() else {
+            return send(ProcessEvent::End(source)).await;
         };
-        let _ = events.send(end).await;
-        return;
+        loop {
+            let mut records = Vec::new();
+            let read = take_records(&socket, &mut buffer, &mut records);
+            let (is_idle, is_full) = (records.is_empty(), records.len() >= MAX_BATCH);
+            if !is_idle {
+                send(ProcessEvent::Records(source, records)).await?;
+            }
+            match read {
+                Batch::End => return send(ProcessEvent::End(source)).await,
+                Batch::Malformed(why) => return send(ProcessEvent::Malformed(source, why)).await,
+                Batch::Open if is_full => tokio::task::yield_now().await,
+                Batch::Open if is_idle => break,
+                Batch::Open => tokio::time::sleep(INTERVAL).await,
+            }
+        }
+        process = match tokio::net::UnixDatagram::from_std(socket) {
+            Ok(process) => process,
+            Err(_) => return send(ProcessEvent::End(source)).await,
+        };
     }
+}
+
+/// State of a connection after reading the records that are there.
+enum Batch {
+    Open,
+    End,
+    Malformed(RecordError),
+}
+
+/// Takes the records that are there, up to the maximum of a batch.
+fn take_records(socket: &UnixDatagram, buffer: &mut [u8], records: &mut Vec<Record>) -> Batch {
+    while records.len() < MAX_BATCH {
+        let bytes = match socket.recv(buffer) {
+            // Records are never empty, so an empty one is the end of the connection.
+            Ok(0) => return Batch::End,
+            Ok(len) => buffer.get(..len).unwrap_or_default(),
+            Err(error) if error.kind() == ErrorKind::WouldBlock => return Batch::Open,
+            Err(error) if error.kind() == ErrorKind::Interrupted => continue,
+            Err(_) => return Batch::End,
+        };
+        match Record::parse(&Bytes::copy_from_slice(bytes)) {
+            Ok(record) => records.push(record),
+            Err(why) => return Batch::Malformed(why),
+        }
+    }
+    Batch::Open
 }

@@ -57,12 +57,12 @@ pub struct Watcher {
     maintenance: JoinHandle<()>,
 }
 
-/// Maximum number of received records that wait to be joined. Beyond it the watcher stops reading,
+/// Maximum number of received batches of records that wait to be joined. Beyond it the watcher stops reading,
 /// and the queues of the processes fill.
-const MAX_WAITING: usize = 4096;
+const MAX_WAITING: usize = 16;
 /// Time for the processes of the domain to connect before [`Watcher::open`] returns.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(1);
-/// Maximum number of records that are joined before the next event is returned.
+/// Maximum number of batches that are joined before the next event is returned.
 const BATCH: usize = 2 * MAX_WAITING;
 
 impl Watcher {
@@ -172,8 +172,11 @@ impl Watcher {
     fn handle(&mut self, event: ProcessEvent) {
         match event {
             ProcessEvent::Begin(source, name) => self.joiner.handle_begin(source, name),
-            ProcessEvent::Record(source, record) => {
-                self.joiner.handle(Instant::now(), source, record)
+            ProcessEvent::Records(source, records) => {
+                let now = Instant::now();
+                for record in records {
+                    self.joiner.handle(now, source, record);
+                }
             }
             ProcessEvent::Malformed(source, why) => self.joiner.handle_malformed(source, why),
             ProcessEvent::End(source) => self.joiner.handle_end(source),

@@ -26,7 +26,7 @@ use crate::report::Failure;
 const KEPT: Duration = Duration::from_secs(600);
 
 /// Time between two looks into the directory.
-const INTERVAL: Duration = Duration::from_millis(500);
+const INTERVAL: Duration = Duration::from_secs(1);
 
 /// Time that rates and percentiles cover.
 const WINDOW: Duration = Duration::from_secs(5);
@@ -178,7 +178,7 @@ async fn follow(
                 _ = ticks.tick() => {
                     let counted = observer.snapshot(&watcher);
                     let entries = watcher.directory().entries();
-                    observation.picture.lock().look(SystemTime::now(), &entries, &counted);
+                    observation.picture.lock().look(SystemTime::now(), &entries, counted);
                     if observation.last.lock().elapsed() >= KEPT {
                         return;
                     }

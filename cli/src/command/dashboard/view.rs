@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use serde::Serialize;
 use serde_json::Value;
 
 /// Rows by section and key. Equal rows have equal texts.
@@ -17,9 +18,16 @@ impl View {
     }
 
     /// Adds a row.
-    pub(super) fn put(&mut self, section: &'static str, key: impl Into<String>, row: &Value) {
+    pub(super) fn put(
+        &mut self,
+        section: &'static str,
+        key: impl Into<String>,
+        row: &impl Serialize,
+    ) {
         let rows = self.sections.entry(section).or_default();
-        rows.insert(key.into(), row.to_string());
+        // Texts, numbers, and lists of them are always representable.
+        let row = serde_json::to_string(row).unwrap_or_else(|_| "null".to_owned());
+        rows.insert(key.into(), row);
     }
 
     /// Returns the whole view as a JSON object: section, key, row.

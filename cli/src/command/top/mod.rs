@@ -28,7 +28,7 @@ use tokio::time::MissedTickBehavior;
 
 use self::meter::{Meter, Observed};
 use self::peers::Peers;
-pub(in crate::command) use self::print::{agent_object, peer_object, totals_object};
+pub(in crate::command) use self::print::{AgentCounts, TotalsObject, peer_object};
 use self::screen::Palette;
 pub(in crate::command) use self::table::{AgentRow, Snapshot};
 use self::table::{Column, Surroundings};

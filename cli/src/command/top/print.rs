@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use fipa::Matcher;
 use fipa_acl::{escape, escape_name};
-use serde_json::{Map, Value, json};
+use serde::Serialize;
+use serde_json::{Value, json};
 
 use super::peers::{PeerRow, PeerState};
 use super::table::{self, AgentRow, Column, Header, Order, PEER_TITLES, Snapshot};
@@ -65,69 +66,131 @@ fn head(header: &Header) -> String {
 
 /// The domain as a JSON object.
 pub(super) fn json(snapshot: &Snapshot, order: Order, shown: Option<&Matcher>) -> Value {
-    let agents = snapshot.sorted(order, shown).into_iter().map(agent_object);
-    let agents = agents.collect::<Vec<_>>();
-    let mut object = totals_object(snapshot);
-    let mut put = |key: &str, value: Value| object.insert(key.to_owned(), value);
-    put(
-        "time",
-        output::rfc3339(snapshot.header.surroundings.time).into(),
-    );
-    put("agents", agents.into());
-    put("others", snapshot.others.as_ref().map(agent_object).into());
-    put(
-        "hosts",
-        snapshot
-            .peers
-            .iter()
-            .map(peer_object)
-            .collect::<Vec<_>>()
-            .into(),
-    );
-    Value::Object(object)
+    let agents = snapshot.sorted(order, shown).into_iter();
+    json!(DomainObject {
+        totals: TotalsObject::of(snapshot),
+        time: output::rfc3339(snapshot.header.surroundings.time),
+        agents: agents.map(AgentObject::of).collect(),
+        others: snapshot.others.as_ref().map(AgentObject::of),
+        hosts: snapshot.peers.iter().map(peer_object).collect(),
+    })
+}
+
+#[derive(Debug, Serialize)]
+struct DomainObject<'a> {
+    #[serde(flatten)]
+    totals: TotalsObject<'a>,
+    time: Option<String>,
+    agents: Vec<AgentObject<'a>>,
+    others: Option<AgentObject<'a>>,
+    hosts: Vec<Value>,
 }
 
 /// The values of the whole domain, without the time.
-pub(in crate::command) fn totals_object(snapshot: &Snapshot) -> Map<String, Value> {
-    let Header {
-        surroundings,
-        rates,
-        total,
-        latency,
-        lost,
-    } = &snapshot.header;
-    let totals = json!({
-        "domain": surroundings.domain, "host": surroundings.host,
-        "agents_here": surroundings.here, "agents_elsewhere": surroundings.elsewhere,
-        "processes": surroundings.processes, "gateway": surroundings.gateway,
-        "problem": surroundings.problem,
-        "letters_per_second": rounded(rates.sent), "failures_per_second": rounded(rates.failed),
-        "violations_per_second": rounded(rates.violations),
-        "letters": total.sent, "failures": total.failed, "violations": total.violations,
-        "median_us": median(*latency), "p99_us": percentile_99(*latency), "lost": lost,
-    });
-    match totals {
-        Value::Object(totals) => totals,
-        _ => Map::new(),
+#[derive(Debug, Serialize)]
+pub(in crate::command) struct TotalsObject<'a> {
+    domain: &'a str,
+    host: &'a str,
+    agents_here: usize,
+    agents_elsewhere: usize,
+    processes: usize,
+    gateway: Option<&'a str>,
+    problem: Option<&'a str>,
+    pub(in crate::command) letters_per_second: f64,
+    pub(in crate::command) failures_per_second: f64,
+    violations_per_second: f64,
+    letters: u64,
+    failures: u64,
+    violations: u64,
+    pub(in crate::command) median_us: Option<u64>,
+    p99_us: Option<u64>,
+    lost: u64,
+}
+
+impl<'a> TotalsObject<'a> {
+    pub(in crate::command) fn of(snapshot: &'a Snapshot) -> Self {
+        let Header {
+            surroundings,
+            rates,
+            total,
+            latency,
+            lost,
+        } = &snapshot.header;
+        Self {
+            domain: &surroundings.domain,
+            host: &surroundings.host,
+            agents_here: surroundings.here,
+            agents_elsewhere: surroundings.elsewhere,
+            processes: surroundings.processes,
+            gateway: surroundings.gateway.as_deref(),
+            problem: surroundings.problem.as_deref(),
+            letters_per_second: rounded(rates.sent),
+            failures_per_second: rounded(rates.failed),
+            violations_per_second: rounded(rates.violations),
+            letters: total.sent,
+            failures: total.failed,
+            violations: total.violations,
+            median_us: median(*latency),
+            p99_us: percentile_99(*latency),
+            lost: *lost,
+        }
+    }
+}
+
+/// The counted letters of an agent.
+#[derive(Debug, Serialize)]
+pub(in crate::command) struct AgentCounts {
+    sent_per_second: f64,
+    received_per_second: f64,
+    failures_per_second: f64,
+    sent: u64,
+    received: u64,
+    failures: u64,
+    violations: u64,
+    median_us: Option<u64>,
+    p99_us: Option<u64>,
+    via: Option<&'static str>,
+}
+
+impl AgentCounts {
+    pub(in crate::command) fn of(row: &AgentRow) -> Self {
+        let AgentRow {
+            name: _,
+            rates,
+            total,
+            latency,
+            via,
+        } = row;
+        Self {
+            sent_per_second: rounded(rates.sent),
+            received_per_second: rounded(rates.received),
+            failures_per_second: rounded(rates.failed),
+            sent: total.sent,
+            received: total.received,
+            failures: total.failed,
+            violations: total.violations,
+            median_us: median(*latency),
+            p99_us: percentile_99(*latency),
+            via: via.map(fipa::Kind::name),
+        }
     }
 }
 
 /// The object of an agent.
-pub(in crate::command) fn agent_object(row: &AgentRow) -> Value {
-    let AgentRow {
-        name,
-        rates,
-        total,
-        latency,
-        via,
-    } = row;
-    json!({
-        "name": name, "sent_per_second": rounded(rates.sent),
-        "received_per_second": rounded(rates.received), "failures_per_second": rounded(rates.failed),
-        "sent": total.sent, "received": total.received, "failures": total.failed,
-        "violations": total.violations, "median_us": median(*latency),
-        "p99_us": percentile_99(*latency), "via": via.map(fipa::Kind::name),
-    })
+#[derive(Debug, Serialize)]
+struct AgentObject<'a> {
+    name: &'a str,
+    #[serde(flatten)]
+    counts: AgentCounts,
+}
+
+impl<'a> AgentObject<'a> {
+    fn of(row: &'a AgentRow) -> Self {
+        Self {
+            name: &row.name,
+            counts: AgentCounts::of(row),
+        }
+    }
 }
 
 /// The object of another host.

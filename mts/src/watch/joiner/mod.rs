@@ -6,7 +6,7 @@
 //! records of this and earlier letters arrive, and then becomes an event, in the order of sending.
 //! A later outcome is an event of its own.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -24,8 +24,7 @@ const TIMEOUT: Duration = Duration::from_millis(250);
 const MAX_WAITING: usize = 65_536;
 /// Maximum number of reported letters that are remembered, because their outcomes may still arrive.
 const MAX_OPEN: usize = 65_536;
-/// Maximum number of other reported letters that are remembered, so that none is reported twice. Each takes some
-/// kilobytes.
+/// Maximum number of other reported letters whose keys are remembered, so that none is reported twice.
 const MAX_SETTLED: usize = 16_384;
 /// Maximum number of outcomes of unknown letters that are remembered.
 const MAX_EARLY: usize = 4096;
@@ -153,8 +152,10 @@ pub struct Joiner {
     waiting: BTreeMap<SendPosition, Key>,
     /// Letters that were reported without an outcome, in order.
     open: VecDeque<Key>,
-    /// The other letters that were reported, in order.
-    settled: VecDeque<Key>,
+    /// The other letters that were reported: no further record changes them.
+    settled: HashSet<Key>,
+    /// The same letters, in order.
+    settled_in_order: VecDeque<Key>,
     outcomes_before_letters: HashMap<Key, (SystemTime, Outcome, bool)>,
     processes: HashMap<RecordSource, Process>,
     events: VecDeque<Event>,
@@ -226,7 +227,7 @@ impl Joiner {
         match body {
             RecordBody::Letter { id, place, letter } => {
                 let gateway = matches!(place, Seen::Passed(..)).then(|| self.name(from));
-                self.seen(now, at, id, place, *letter, gateway);
+                self.seen(now, at, id, place, letter, gateway);
             }
             RecordBody::Settled {
                 id,
@@ -262,6 +263,9 @@ impl Joiner {
         gateway: Option<Arc<str>>,
     ) {
         let key = (id.stream.sender, id.sequence);
+        if self.settled.contains(&key) {
+            return;
+        }
         let content = letter.content.clone();
         if !self.letters.contains_key(&key) {
             self.begin(now, at, key, id, letter);
@@ -292,13 +296,6 @@ impl Joiner {
     }
 
     fn begin(&mut self, now: Instant, at: SystemTime, key: Key, id: LetterId, letter: SeenLetter) {
-        let SeenLetter {
-            envelope,
-            message,
-            content_len,
-            content,
-            size,
-        } = letter;
         self.arrived += 1;
         let place = (at, self.arrived);
         let mut passage = Passage {
@@ -308,11 +305,11 @@ impl Joiner {
             sequence: id.sequence,
             submission: None,
             receiver: id.receiver,
-            envelope,
-            message,
-            content_len,
-            content,
-            size,
+            envelope: letter.decode_envelope(),
+            message: letter.decode_message(),
+            content_len: letter.content_len,
+            content: letter.content,
+            size: letter.size,
             via: None,
             gateway: None,
             from_elsewhere: false,
@@ -336,6 +333,9 @@ impl Joiner {
 
     fn settled(&mut self, at: SystemTime, id: LetterId, outcome: Outcome, sender: bool) {
         let key = (id.stream.sender, id.sequence);
+        if self.settled.contains(&key) {
+            return;
+        }
         let Some(known) = self.letters.get_mut(&key) else {
             if self.outcomes_before_letters.len() >= MAX_EARLY {
                 // Of letters whose first record was lost or precedes the watch.
@@ -401,32 +401,36 @@ impl Joiner {
     }
 
     fn report(&mut self, key: Key) -> Option<Event> {
-        let is_settled = {
-            let known = self.letters.get(&key)?;
-            match known.passage.fate {
-                Fate::Settled(_) => true,
-                // Its sender sends no records.
-                Fate::Taken => known.passage.from_elsewhere,
-                Fate::UnderWay | Fate::Passed(_) => false,
+        let mut known = self.letters.remove(&key)?;
+        self.number += 1;
+        known.passage.number = self.number;
+        let is_settled = match known.passage.fate {
+            Fate::Settled(_) => true,
+            // Its sender sends no records.
+            Fate::Taken => known.passage.from_elsewhere,
+            Fate::UnderWay | Fate::Passed(_) => false,
+        };
+        if is_settled {
+            if self.settled_in_order.len() >= MAX_SETTLED
+                && let Some(oldest) = self.settled_in_order.pop_front()
+            {
+                self.settled.remove(&oldest);
             }
-        };
-        let (reported, most) = match is_settled {
-            true => (&mut self.settled, MAX_SETTLED),
-            false => (&mut self.open, MAX_OPEN),
-        };
-        if reported.len() >= most
-            && let Some(oldest) = reported.pop_front()
+            self.settled.insert(key);
+            self.settled_in_order.push_back(key);
+            return Some(Event::Letter(Arc::new(known.passage)));
+        }
+        if self.open.len() >= MAX_OPEN
+            && let Some(oldest) = self.open.pop_front()
         {
             self.letters.remove(&oldest);
         }
-        reported.push_back(key);
-        let known = self.letters.get_mut(&key)?;
-        self.number += 1;
-        known.passage.number = self.number;
-        known.reported = true;
+        self.open.push_back(key);
         let passage = Arc::new(known.passage.clone());
         // The content has been reported and is not kept.
         known.passage.content = Bytes::new();
+        known.reported = true;
+        self.letters.insert(key, known);
         Some(Event::Letter(passage))
     }
 }

@@ -17,18 +17,18 @@ fn id(sender: u64, sequence: u64) -> LetterId {
     }
 }
 
-fn letter() -> Box<SeenLetter> {
+fn letter() -> SeenLetter {
     let message = Message::builder(Performative::Request)
         .sender(AgentId::new("rover").unwrap())
         .build()
         .unwrap();
-    Box::new(SeenLetter {
-        envelope: None,
-        message: Some(message),
+    SeenLetter {
+        envelope: Bytes::new(),
+        message: message.to_payload().to_bytes(),
         content_len: None,
         content: Bytes::new(),
         size: 100,
-    })
+    }
 }
 
 fn at(ms: u64) -> SystemTime {
@@ -284,11 +284,12 @@ fn letters_with_an_outcome_are_remembered_for_a_while() {
         reported += all(&mut joiner, start + HOLD).len();
     }
     assert_eq!(reported as u64, count);
-    assert_eq!(joiner.letters.len(), MAX_SETTLED);
+    assert_eq!(joiner.settled.len(), MAX_SETTLED);
+    assert_eq!(joiner.settled_in_order.len(), MAX_SETTLED);
     // The receiver's record of a letter that was reported long ago adds none.
     let taken = seen(count, id(7, count - MAX_SETTLED as u64), Seen::Taken(None));
     joiner.handle(start, B, taken);
-    assert_eq!(joiner.letters.len(), MAX_SETTLED);
+    assert!(joiner.letters.is_empty());
 }
 
 /// Letters of several senders, with up to four records each that arrive late, in any order, twice

@@ -111,7 +111,7 @@ pub enum RecordBody {
         /// Point of the route at which it is reported.
         place: Seen,
         /// Data of the letter.
-        letter: Box<SeenLetter>,
+        letter: SeenLetter,
     },
     /// A letter has an outcome.
     Settled {
@@ -157,13 +157,14 @@ pub enum Origin {
     OtherHost,
 }
 
-/// Reported data of a letter.
+/// Reported data of a letter. Several records report the same letter, so its parts are decoded by the receiver of the
+/// first one only.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SeenLetter {
-    /// Its envelope, unless it is too long or malformed.
-    pub envelope: Option<Envelope>,
-    /// Its message without content, unless it is too long or malformed.
-    pub message: Option<Message>,
+    /// Its encoded envelope; empty if it is too long.
+    pub envelope: Bytes,
+    /// Its encoded message without content; empty if it is too long or malformed.
+    pub message: Bytes,
     /// Length of the content in bytes, if the message has content.
     pub content_len: Option<u64>,
     /// The content or its beginning, up to the length that the watcher requested.
@@ -413,7 +414,7 @@ impl Record {
             SENT | TAKEN | PASSED => RecordBody::Letter {
                 id: header.id(&name)?,
                 place: header.place()?,
-                letter: Box::new(header.letter(&envelope, message, content)?),
+                letter: header.letter(envelope, message, content)?,
             },
             SETTLED => RecordBody::Settled {
                 id: header.id(&name)?,
@@ -457,20 +458,10 @@ impl Header {
 
     fn letter(
         &self,
-        envelope: &Bytes,
+        envelope: Bytes,
         message: Bytes,
         content: Bytes,
     ) -> Result<SeenLetter, RecordError> {
-        // Unchanged from the letter, and not yet checked as a whole.
-        let whole = |(decoded, len): (Envelope, usize)| (len == envelope.len()).then_some(decoded);
-        let envelope = Envelope::decode(envelope).ok().and_then(whole);
-        let message = match message.is_empty() {
-            true => None,
-            // The reporting process encoded it.
-            false => {
-                Some(Message::decode(&message.into()).map_err(|_| RecordError::Part("message"))?)
-            }
-        };
         let content_len = (self.flags & CONTENT != 0).then(|| self.content_len.get());
         if content.len() as u64 > content_len.unwrap_or(0) || content.len() > MAX_CONTENT {
             return Err(RecordError::Part("content"));
@@ -482,6 +473,22 @@ impl Header {
             content,
             size: self.size.get(),
         })
+    }
+}
+
+impl SeenLetter {
+    /// Decodes the envelope; `None` if it is too long or malformed.
+    #[must_use]
+    pub fn decode_envelope(&self) -> Option<Envelope> {
+        // Unchanged from the letter, and not yet checked as a whole.
+        let (decoded, len) = Envelope::decode(&self.envelope).ok()?;
+        (len == self.envelope.len()).then_some(decoded)
+    }
+
+    /// Decodes the message without content; `None` if it is too long or malformed.
+    #[must_use]
+    pub fn decode_message(&self) -> Option<Message> {
+        Message::decode(&self.message.clone().into()).ok()
     }
 }
 

@@ -25,37 +25,89 @@ export function link(view, name, text = name) {
   return element('a', { href: `#/${view}/${encodeURIComponent(name)}` }, text);
 }
 
+/** Time for rows in one frame, in milliseconds. Further rows follow in the next frames, so that the page answers. */
+const SLICE = 8;
+/** The tables with rows to draw. */
+const waiting = new Set();
+let due = 0;
+
+function work() {
+  due = 0;
+  const end = performance.now() + SLICE;
+  for (const rows of waiting) {
+    if (!rows.work(end)) break;
+    waiting.delete(rows);
+  }
+  if (waiting.size > 0) due = requestAnimationFrame(work);
+}
+
+/** Makes a row like another one. The cells that are equal stay, and with them focus and selection. */
+function patch(row, next) {
+  row.className = next.className;
+  [...next.children].forEach((cell, index) => {
+    if (!row.children[index].isEqualNode(cell)) row.children[index].replaceWith(cell);
+  });
+}
+
 /**
- * The body of a table whose rows have keys. A row that did not change keeps its nodes, so that focus, selection and
- * the place of scrolling stay.
+ * The body of a table whose rows have keys. A row whose value is the same object as before keeps its nodes, so that
+ * focus, selection and the place of scrolling stay.
  */
 export class Rows {
-  constructor(body, draw) {
+  constructor(body, draw, isPatched = false) {
     this.body = body;
     this.draw = draw;
+    this.isPatched = isPatched;
     this.shown = new Map();
+    this.next = null;
+    this.steps = null;
   }
 
-  /** Shows these rows, pairs of key and value, in this order. */
+  /** Shows these rows, pairs of key and value, in this order: from the next frame on, and completely. */
   show(rows) {
-    const kept = new Map();
+    this.next = rows;
+    waiting.add(this);
+    due ||= requestAnimationFrame(work);
+  }
+
+  /** Draws until a time. Returns whether all rows are shown. */
+  work(end) {
+    while (this.steps || this.next) {
+      this.steps ??= this.drawing();
+      while (!this.steps.next().done) if (performance.now() >= end) return false;
+      this.steps = null;
+    }
+    return true;
+  }
+
+  /** Shows the next rows, one a step. */
+  * drawing() {
+    const rows = this.next;
+    this.next = null;
+    const keys = new Set(rows.map(([key]) => key));
+    for (const [key, { node }] of this.shown) {
+      if (keys.has(key)) continue;
+      node.remove();
+      this.shown.delete(key);
+    }
     let place = this.body.firstChild;
     for (const [key, value] of rows) {
-      const text = JSON.stringify(value);
       const before = this.shown.get(key);
       let node = before?.node;
-      if (before?.text !== text) {
-        node = this.draw(value, key);
-        before?.node.replaceWith(node);
-        if (before && place === before.node) place = node;
+      if (before?.value !== value) {
+        const drawn = this.draw(value, key);
+        if (before && this.isPatched) patch(node, drawn);
+        else {
+          before?.node.replaceWith(drawn);
+          if (before && place === before.node) place = drawn;
+          node = drawn;
+        }
       }
       if (node === place) place = place.nextSibling;
       else this.body.insertBefore(node, place);
-      kept.set(key, { node, text });
-      this.shown.delete(key);
+      this.shown.set(key, { node, value });
+      yield;
     }
-    for (const { node } of this.shown.values()) node.remove();
-    this.shown = kept;
   }
 }
 
@@ -66,6 +118,26 @@ export function table(caption, columns, draw) {
   const node = element('div', { class: 'wide' },
     element('table', {}, element('caption', {}, caption), element('thead', {}, element('tr', {}, heads)), body));
   return { node, rows: new Rows(body, draw) };
+}
+
+/**
+ * A table for thousands of rows: the browser lays out only those in sight. Columns have the widths of the style sheet.
+ * Cells must not have handlers that depend on the value.
+ */
+export function longTable(caption, columns, draw) {
+  // The boxes are no boxes of a table, so the roles are written down.
+  const role = (node, ofChildren) => {
+    node.setAttribute('role', 'row');
+    for (const cell of node.children) cell.setAttribute('role', ofChildren);
+    return node;
+  };
+  const { node } = table(caption, columns, draw);
+  node.classList.add('long');
+  node.querySelector('table').setAttribute('role', 'table');
+  const [head, body] = node.querySelectorAll('thead, tbody');
+  for (const group of [head, body]) group.setAttribute('role', 'rowgroup');
+  role(head.firstChild, 'columnheader');
+  return { node, rows: new Rows(body, (value, key) => role(draw(value, key), 'cell'), true) };
 }
 
 /** The violations and failures of an agent or a conversation. */

@@ -1,6 +1,6 @@
 // Hosts with their agents, and one agent.
 
-import { clock, element, link, problems, rate, seconds, span, table } from './elements.js';
+import { clock, element, link, longTable, problems, rate, seconds, span, table } from './elements.js';
 import { chart } from './chart.js';
 import { coalitions, members } from './coalitions.js';
 import { conversationTable } from './conversations.js';
@@ -44,7 +44,7 @@ class HostCard {
   constructor(name, isOwn) {
     this.isOwn = isOwn;
     this.state = element('p', {});
-    const agents = table(isOwn ? 'Agents of this host' : `Agents of ${name}`, COLUMNS, agentRow);
+    const agents = longTable(isOwn ? 'Agents of this host' : `Agents of ${name}`, COLUMNS, agentRow);
     this.agents = agents.rows;
     this.none = element('p', { class: 'faint' }, 'no agents');
     this.node = element('section', { class: 'card', 'aria-label': name },

@@ -1,15 +1,15 @@
 //! The agents in the directory, and those that were in it.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fipa::admin::routes::ASKER_TYPE;
 use fipa::{Entry, Reach, Role};
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use super::{clipped, moment};
-use crate::command::top::{AgentRow, agent_object};
+use crate::command::top::{AgentCounts, AgentRow};
 
 /// Maximum number of agents; further ones are not shown.
 const MAX_AGENTS: usize = 2000;
@@ -21,6 +21,8 @@ const KEPT: Duration = Duration::from_secs(3600);
 #[derive(Debug, Default)]
 pub(super) struct Agents {
     known: BTreeMap<String, Agent>,
+    /// The directory at the last look.
+    entries: Arc<[Arc<Entry>]>,
 }
 
 #[derive(Debug)]
@@ -36,9 +38,34 @@ struct Agent {
     ended: Option<SystemTime>,
 }
 
+/// The row of an agent.
+#[derive(Debug, Serialize)]
+pub(super) struct Row<'a> {
+    name: &'a str,
+    host: Option<&'a str>,
+    here: bool,
+    #[serde(rename = "type")]
+    kind: &'a str,
+    description: &'a str,
+    registered: &'a str,
+    ended: Option<String>,
+    members: Option<&'a [String]>,
+    leader: Option<&'a str>,
+    #[serde(flatten)]
+    counts: Option<AgentCounts>,
+}
+
 impl Agents {
     /// Takes the entries of the directory.
-    pub(super) fn look(&mut self, now: SystemTime, entries: &[Arc<Entry>]) {
+    pub(super) fn look(&mut self, now: SystemTime, entries: &Arc<[Arc<Entry>]>) {
+        self.known.retain(|_, agent| {
+            let age = agent.ended.and_then(|ended| now.duration_since(ended).ok());
+            age.is_none_or(|age| age < KEPT)
+        });
+        if Arc::ptr_eq(entries, &self.entries) {
+            return;
+        }
+        self.entries = Arc::clone(entries);
         let shown = entries
             .iter()
             .filter(|entry| entry.role != Role::Gateway && entry.agent_type != ASKER_TYPE);
@@ -50,9 +77,7 @@ impl Agents {
             present.insert(clipped(&entry.name), Agent::of(entry));
         }
         for (name, agent) in std::mem::take(&mut self.known) {
-            let age = agent.ended.and_then(|ended| now.duration_since(ended).ok());
-            let is_kept = age.is_none_or(|age| age < KEPT) && present.len() < MAX_AGENTS;
-            if is_kept && !present.contains_key(&name) {
+            if present.len() < MAX_AGENTS && !present.contains_key(&name) {
                 let ended = Some(agent.ended.unwrap_or(now));
                 present.insert(name, Agent { ended, ..agent });
             }
@@ -63,26 +88,20 @@ impl Agents {
     /// The rows by name, with the counted letters.
     pub(super) fn rows<'a>(
         &'a self,
-        counted: &[AgentRow],
-    ) -> impl Iterator<Item = (&'a str, Value)> {
-        let mut counted: BTreeMap<String, Value> = counted
-            .iter()
-            .map(|row| (row.name.clone(), agent_object(row)))
-            .collect();
+        counted: &'a [AgentRow],
+    ) -> impl Iterator<Item = (&'a str, Row<'a>)> {
+        let counted: HashMap<&str, &AgentRow> =
+            counted.iter().map(|row| (&*row.name, row)).collect();
         self.known.iter().map(move |(name, agent)| {
-            let mut row = agent.row(name);
-            if let (Some(row), Some(Value::Object(counted))) =
-                (row.as_object_mut(), counted.remove(name))
-            {
-                row.extend(counted);
-            }
-            (name.as_str(), row)
+            let counts = counted.get(name.as_str()).map(|row| AgentCounts::of(row));
+            (name.as_str(), agent.row(name, counts))
         })
     }
 
     /// The row of an agent.
-    pub(super) fn row(&self, name: &str) -> Option<Value> {
-        self.known.get(name).map(|agent| agent.row(name))
+    pub(super) fn row(&self, name: &str) -> Option<Row<'_>> {
+        let (name, agent) = self.known.get_key_value(name)?;
+        Some(agent.row(name, None))
     }
 }
 
@@ -107,11 +126,18 @@ impl Agent {
         }
     }
 
-    fn row(&self, name: &str) -> Value {
-        json!({
-            "name": name, "host": self.host, "here": self.is_here, "type": self.kind,
-            "description": self.description, "registered": self.registered, "ended": self.ended.map(moment),
-            "members": self.members, "leader": self.leader,
-        })
+    fn row<'a>(&'a self, name: &'a str, counts: Option<AgentCounts>) -> Row<'a> {
+        Row {
+            name,
+            host: self.host.as_deref(),
+            here: self.is_here,
+            kind: &self.kind,
+            description: &self.description,
+            registered: &self.registered,
+            ended: self.ended.map(moment),
+            members: self.members.as_deref(),
+            leader: self.leader.as_deref(),
+            counts,
+        }
     }
 }

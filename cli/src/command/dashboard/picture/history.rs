@@ -3,9 +3,9 @@
 use std::collections::VecDeque;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use serde_json::{Value, json};
+use serde::Serialize;
 
-use crate::command::top::{Snapshot, totals_object};
+use crate::command::top::{Snapshot, TotalsObject};
 
 /// Number of points, one a second.
 const MAX_POINTS: usize = 600;
@@ -13,7 +13,14 @@ const MAX_POINTS: usize = 600;
 /// The points by their time, in seconds since 1970.
 #[derive(Debug, Default)]
 pub(super) struct History {
-    points: VecDeque<(u64, Value)>,
+    points: VecDeque<(u64, Point)>,
+}
+
+#[derive(Debug, Serialize)]
+pub(super) struct Point {
+    letters_per_second: f64,
+    failures_per_second: f64,
+    median_us: Option<u64>,
 }
 
 impl History {
@@ -30,16 +37,16 @@ impl History {
         if self.points.len() >= MAX_POINTS {
             self.points.pop_front();
         }
-        let totals = totals_object(counted);
-        let value = |key: &str| totals.get(key).cloned().unwrap_or_default();
-        let point = json!({
-            "letters_per_second": value("letters_per_second"), "failures_per_second": value("failures_per_second"),
-            "median_us": value("median_us"),
-        });
+        let totals = TotalsObject::of(counted);
+        let point = Point {
+            letters_per_second: totals.letters_per_second,
+            failures_per_second: totals.failures_per_second,
+            median_us: totals.median_us,
+        };
         self.points.push_back((second, point));
     }
 
-    pub(super) fn points(&self) -> impl Iterator<Item = (u64, &Value)> {
+    pub(super) fn points(&self) -> impl Iterator<Item = (u64, &Point)> {
         self.points.iter().map(|(second, point)| (*second, point))
     }
 }

@@ -1,10 +1,13 @@
 //! The newest letters.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::SystemTime;
 
 use fipa::Outcome;
 use fipa::admin::watch::{Fate, Passage};
-use serde_json::{Map, Value, json};
+use serde::Serialize;
+use serde_json::{Map, Value};
 
 use super::{clipped, moment};
 use crate::command::watch::checker::CheckResult;
@@ -17,88 +20,108 @@ const MAX_LETTERS: usize = 5000;
 #[derive(Debug, Clone)]
 pub(super) struct Letter {
     pub(super) number: u64,
-    at: String,
+    pub(super) at: SystemTime,
     pub(super) from: String,
     pub(super) to: String,
     performative: String,
-    protocol: Option<String>,
-    conversation: Option<String>,
+    pub(super) protocol: Option<String>,
+    pub(super) conversation: Option<String>,
     size: u64,
     via: Option<&'static str>,
     gateway: Option<String>,
-    fate: Map<String, Value>,
+    fate: Fate,
     pub(super) violation: Option<String>,
-    pub(super) has_failed: bool,
+}
+
+/// The row of a letter.
+#[derive(Debug, Serialize)]
+pub(super) struct LetterRow<'a> {
+    number: u64,
+    time: String,
+    from: &'a str,
+    to: &'a str,
+    performative: &'a str,
+    protocol: Option<&'a str>,
+    conversation: Option<&'a str>,
+    size: u64,
+    via: Option<&'static str>,
+    gateway: Option<&'a str>,
+    fate: Map<String, Value>,
+    violation: Option<&'a str>,
 }
 
 impl Letter {
     pub(super) fn of(passage: &Passage, checked: &CheckResult) -> Self {
         let message = passage.message.as_ref();
-        let mut letter = Self {
+        Self {
             number: passage.number,
-            at: moment(passage.at),
+            at: passage.at,
             from: clipped(passage.sender().unwrap_or("?")),
             to: clipped(&passage.receiver),
             performative: clipped(message.map_or("?", |it| it.performative().as_str())),
             protocol: message.and_then(|it| it.protocol()).map(clipped),
             conversation: message.and_then(|it| it.conversation_id()).map(clipped),
             size: passage.size,
-            via: None,
-            gateway: None,
-            fate: Map::new(),
+            via: passage.via.map(fipa::Kind::name),
+            gateway: passage.gateway.as_deref().map(clipped),
+            fate: passage.fate.clone(),
             violation: match checked {
                 CheckResult::Violation(violation) => Some(clipped(&violation.to_string())),
                 _ => None,
             },
-            has_failed: false,
-        };
-        letter.news(passage);
-        letter
+        }
     }
 
     /// Takes later news of it.
     pub(super) fn news(&mut self, passage: &Passage) {
         self.via = passage.via.map(fipa::Kind::name);
         self.gateway = passage.gateway.as_deref().map(clipped);
-        self.has_failed = matches!(&passage.fate, Fate::Settled(Outcome::Failed { .. }));
-        self.fate = Map::new();
-        json::fate(&mut self.fate, &passage.fate);
+        self.fate.clone_from(&passage.fate);
     }
 
     /// The reason why it was not delivered.
-    pub(super) fn reason(&self) -> Option<&str> {
-        self.fate.get("reason").and_then(Value::as_str)
+    pub(super) fn reason(&self) -> Option<String> {
+        match &self.fate {
+            Fate::Passed(Outcome::Failed { reason, .. })
+            | Fate::Settled(Outcome::Failed { reason, .. }) => Some(reason.to_string()),
+            _ => None,
+        }
     }
 
-    /// Its time as RFC 3339.
-    pub(super) fn time(&self) -> &str {
-        &self.at
-    }
-
-    /// Whether it was sent before this time in RFC 3339, of which all have the same form.
-    pub(super) fn is_before(&self, time: &str) -> bool {
-        *self.at < *time
+    /// Whether its sender was told that it was not delivered.
+    pub(super) fn has_failed(&self) -> bool {
+        matches!(&self.fate, Fate::Settled(Outcome::Failed { .. }))
     }
 
     /// The row of the letter.
-    pub(super) fn row(&self) -> Value {
-        json!({
-            "number": self.number, "time": self.at, "from": self.from, "to": self.to,
-            "performative": self.performative, "protocol": self.protocol, "conversation": self.conversation,
-            "size": self.size, "via": self.via, "gateway": self.gateway, "fate": self.fate,
-            "violation": self.violation,
-        })
+    pub(super) fn row(&self) -> LetterRow<'_> {
+        let mut fate = Map::new();
+        json::fate(&mut fate, &self.fate);
+        LetterRow {
+            number: self.number,
+            time: moment(self.at),
+            from: &self.from,
+            to: &self.to,
+            performative: &self.performative,
+            protocol: self.protocol.as_deref(),
+            conversation: self.conversation.as_deref(),
+            size: self.size,
+            via: self.via,
+            gateway: self.gateway.as_deref(),
+            fate,
+            violation: self.violation.as_deref(),
+        }
     }
 }
 
 /// The newest letters in the order of their numbers.
 #[derive(Debug, Default)]
 pub(super) struct Letters {
-    newest: VecDeque<Letter>,
+    newest: VecDeque<Arc<Letter>>,
 }
 
 impl Letters {
-    pub(super) fn add(&mut self, letter: Letter) {
+    pub(super) fn add(&mut self, letter: Arc<Letter>) {
         if self.newest.len() >= MAX_LETTERS {
             self.newest.pop_front();
         }
@@ -113,12 +136,12 @@ impl Letters {
         if let Ok(index) = found
             && let Some(letter) = self.newest.get_mut(index)
         {
-            letter.news(passage);
+            Arc::make_mut(letter).news(passage);
         }
     }
 
     /// The letters, the newest first.
     pub(super) fn newest(&self) -> impl Iterator<Item = &Letter> {
-        self.newest.iter().rev()
+        self.newest.iter().rev().map(|letter| &**letter)
     }
 }

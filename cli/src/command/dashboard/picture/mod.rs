@@ -15,10 +15,11 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use fipa::Entry;
 use fipa::admin::watch::{Event, Passage};
 use fipa::locks::ResourceStatus;
-use serde_json::{Value, json};
+use serde::Serialize;
+use serde_json::json;
 
 use self::agents::Agents;
-use self::conversations::Conversations;
+use self::conversations::{Conversation, Conversations};
 use self::goals::Goals;
 pub(super) use self::goals::cancelled_object;
 use self::history::History;
@@ -26,7 +27,7 @@ use self::letters::{Letter, Letters};
 use self::partners::Partners;
 use super::view::View;
 use crate::command::locks;
-use crate::command::top::{Snapshot, peer_object, totals_object};
+use crate::command::top::{Snapshot, TotalsObject, peer_object};
 use crate::command::watch::checker::CheckResult;
 use crate::output;
 
@@ -48,12 +49,22 @@ pub(super) struct Picture {
     history: History,
     locks: Vec<ResourceStatus>,
     pub(super) goals: Goals,
-    /// The fleet at the last look.
-    fleet: Arc<View>,
+    /// The counted letters at the last look.
+    counted: Option<Snapshot>,
+    /// The fleet at the last look, as soon as a page has asked for it.
+    fleet: Option<Arc<View>>,
     /// The reason why the domain cannot be observed.
     problem: Option<String>,
     /// Whether clients may send messages.
     has_control: bool,
+}
+
+/// The values of the whole domain.
+#[derive(Debug, Serialize)]
+struct Totals<'a> {
+    #[serde(flatten)]
+    totals: TotalsObject<'a>,
+    control: bool,
 }
 
 /// A view with its parameter.
@@ -92,8 +103,8 @@ impl Picture {
     pub(super) fn handle(&mut self, event: &Event, checked: Option<&CheckResult>) {
         match (event, checked) {
             (Event::Letter(passage), Some(checked)) => {
-                let letter = Letter::of(passage, checked);
-                self.conversations.add(passage, checked, &letter);
+                let letter = Arc::new(Letter::of(passage, checked));
+                self.conversations.add(&letter, checked);
                 self.letters.add(letter);
             }
             (Event::Later(passage) | Event::Confirmed(passage), _) => self.news(passage),
@@ -107,27 +118,42 @@ impl Picture {
     }
 
     /// Takes the agents in the directory, and the counted letters.
-    pub(super) fn look(&mut self, now: SystemTime, entries: &[Arc<Entry>], counted: &Snapshot) {
+    pub(super) fn look(&mut self, now: SystemTime, entries: &Arc<[Arc<Entry>]>, counted: Snapshot) {
         self.problem = None;
         self.agents.look(now, entries);
-        self.history.add(now, counted);
+        self.history.add(now, &counted);
+        self.counted = Some(counted);
+        self.fleet = None;
+    }
+
+    /// The fleet. All pages share it until the next look.
+    fn fleet(&mut self) -> Arc<View> {
+        if let Some(fleet) = &self.fleet {
+            return Arc::clone(fleet);
+        }
         let mut fleet = View::default();
-        for section in ["agents", "hosts", "history"] {
-            fleet.section(section);
+        if let Some(counted) = &self.counted {
+            for section in ["agents", "hosts", "history"] {
+                fleet.section(section);
+            }
+            for (second, point) in self.history.points() {
+                fleet.put("history", second.to_string(), point);
+            }
+            let totals = Totals {
+                totals: TotalsObject::of(counted),
+                control: self.has_control,
+            };
+            fleet.put("domain", "totals", &totals);
+            for peer in &counted.peers {
+                fleet.put("hosts", clipped(&peer.name), &peer_object(peer));
+            }
+            for (name, row) in self.agents.rows(&counted.agents) {
+                fleet.put("agents", name, &row);
+            }
         }
-        for (second, point) in self.history.points() {
-            fleet.put("history", second.to_string(), point);
-        }
-        let mut totals = totals_object(counted);
-        totals.insert("control".to_owned(), self.has_control.into());
-        fleet.put("domain", "totals", &Value::Object(totals));
-        for peer in &counted.peers {
-            fleet.put("hosts", clipped(&peer.name), &peer_object(peer));
-        }
-        for (name, row) in self.agents.rows(&counted.agents) {
-            fleet.put("agents", name, &row);
-        }
-        self.fleet = Arc::new(fleet);
+        let fleet = Arc::new(fleet);
+        self.fleet = Some(Arc::clone(&fleet));
+        fleet
     }
 
     /// Takes the state of all locks.
@@ -141,14 +167,14 @@ impl Picture {
     }
 
     /// Returns a view.
-    pub(super) fn view(&self, wanted: &Wanted) -> Arc<View> {
+    pub(super) fn view(&mut self, wanted: &Wanted) -> Arc<View> {
         if let Some(problem) = &self.problem {
             let mut view = View::default();
             view.put("domain", "totals", &json!({ "problem": problem }));
             return Arc::new(view);
         }
         match wanted {
-            Wanted::Fleet => return Arc::clone(&self.fleet),
+            Wanted::Fleet => return self.fleet(),
             Wanted::Agent { name, .. } => self.agent(name),
             Wanted::Conversations => self.all_conversations(),
             Wanted::Conversation(id) => self.conversation(id),
@@ -175,11 +201,7 @@ impl Picture {
         if let Some(row) = self.agents.row(name) {
             view.put("agent", name, &row);
         }
-        let takes_part = |row: &Value| {
-            let names = row["participants"].as_array();
-            names.is_some_and(|names| names.iter().any(|it| it == name))
-        };
-        self.put_conversations(&mut view, takes_part);
+        self.put_conversations(&mut view, |conversation| conversation.has(name));
         view
     }
 
@@ -190,10 +212,11 @@ impl Picture {
         view
     }
 
-    fn put_conversations(&self, view: &mut View, shown: impl Fn(&Value) -> bool) {
-        let rows = self.conversations.newest().filter(|(_, row)| shown(row));
-        for (id, row) in rows.take(SHOWN_CONVERSATIONS) {
-            view.put("conversations", id, &row);
+    fn put_conversations(&self, view: &mut View, shown: impl Fn(&Conversation) -> bool) {
+        let newest = self.conversations.newest();
+        let shown = newest.filter(|(_, conversation)| shown(conversation));
+        for (id, conversation) in shown.take(SHOWN_CONVERSATIONS) {
+            view.put("conversations", id, &conversation.row(id));
         }
     }
 
@@ -225,9 +248,9 @@ impl Picture {
     /// The letters at the end of a second.
     fn past(&self, second: u64) -> View {
         let end = UNIX_EPOCH.checked_add(Duration::from_secs(second.saturating_add(1)));
-        let end = end.map(moment).unwrap_or_default();
-        let mut view = self.newest_letters(|letter| letter.is_before(&end));
-        let since = self.letters.newest().last().map(Letter::time);
+        let mut view = self.newest_letters(|letter| end.is_none_or(|end| letter.at < end));
+        let since = self.letters.newest().last();
+        let since = since.map(|letter| moment(letter.at));
         view.put("domain", "totals", &json!({ "since": since }));
         view
     }

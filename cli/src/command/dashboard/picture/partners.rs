@@ -39,14 +39,14 @@ impl Partners {
                 let counts = partners.partners.entry(partner.clone()).or_default();
                 counts.sent += u64::from(is_sent);
                 counts.received += u64::from(!is_sent);
-                counts.failures += u64::from(letter.has_failed);
+                counts.failures += u64::from(letter.has_failed());
                 counts.violations += u64::from(letter.violation.is_some());
             }
             let reason = letter.reason().filter(|_| is_sent);
             if let Some(reason) = reason
-                && (partners.reasons.len() < MAX_ROWS || partners.reasons.contains_key(reason))
+                && (partners.reasons.len() < MAX_ROWS || partners.reasons.contains_key(&reason))
             {
-                *partners.reasons.entry(reason.to_owned()).or_default() += 1;
+                *partners.reasons.entry(reason).or_default() += 1;
             }
         }
         partners
