@@ -51,14 +51,12 @@ fn the_docking_demo_is_followed_live() {
     // The run and its checks end, and the robots stay until the operator has seen them.
     while !demo.line().contains("press Enter to end") {}
     until("the coalition of all three", || {
-        let is_whole = |row: &String| {
-            ["crex", "payload_1", "payload_2"]
-                .iter()
-                .all(|member| row.contains(member))
-        };
-        rows(&browser)
-            .iter()
-            .any(|row| row.starts_with("crex_stack") && is_whole(row))
+        let members = browser.value(
+            "document.querySelector('[aria-label=\"Coalition crex_stack\"] tbody')?.textContent ?? ''",
+        );
+        let members = members.as_str().unwrap();
+        let all = ["crex", "payload_1", "payload_2"];
+        all.iter().all(|member| members.contains(member))
     });
     assert_no_messages(&browser);
     demo.write_line("");
