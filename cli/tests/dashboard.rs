@@ -440,6 +440,9 @@ fn the_page_shows_the_agents_that_run_and_those_that_have_ended() {
             .iter()
             .any(|row| row.starts_with("crane ended"))
     });
+    let alerts = browser.value("document.querySelector('.alerts').innerText");
+    let alerts = alerts.as_str().unwrap();
+    assert!(alerts.starts_with("crane on this host ended"), "{alerts}");
     assert!(
         rows(&browser)
             .iter()

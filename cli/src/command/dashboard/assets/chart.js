@@ -1,6 +1,6 @@
 // Rates of the last minutes. The library uPlot draws them (uplot.js).
 
-import { element } from './elements.js';
+import { clock, element } from './elements.js';
 
 const HEIGHT = 150;
 
@@ -25,7 +25,7 @@ export function chart() {
     plot = new globalThis.uPlot({
       width: Math.max(200, box.clientWidth), height: HEIGHT, legend: { show: false }, cursor: { show: false },
       scales: { y: { range: (_, low, high) => [0, Math.max(1, high * 1.1)] } },
-      axes: [axis, { ...axis, size: 60 }],
+      axes: [{ ...axis, space: 90, values: (_, times) => times.map((time) => clock(time * 1000)) }, { ...axis, size: 60 }],
       hooks: { draw: [drawMark] },
       series: [{}, { stroke: color('--accent'), width: 2, fill: `${color('--accent')}22` },
         { stroke: color('--bad'), width: 2 }],

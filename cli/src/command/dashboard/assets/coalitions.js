@@ -55,7 +55,7 @@ export function members() {
   return { node, show };
 }
 
-/** The coalitions, each with its members, the leader first. */
+/** The coalitions except the owners of locks, each with its members, the leader first. */
 export function coalitions() {
   const grid = element('div', { class: 'hosts' });
   const more = element('p', { class: 'faint', hidden: true });
@@ -64,7 +64,7 @@ export function coalitions() {
   return {
     node,
     show(agents, own) {
-      const all = Object.entries(agents).filter(([, row]) => row.members).sort(([a], [b]) => (a < b ? -1 : 1));
+      const all = Object.entries(agents).filter(([name, row]) => row.members && !name.startsWith('lock:')).sort(([a], [b]) => (a < b ? -1 : 1));
       const shown = new Map(all.slice(0, MAX_SHOWN));
       for (const [name, card] of cards) {
         if (!shown.has(name)) {

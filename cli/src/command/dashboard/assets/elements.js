@@ -20,6 +20,11 @@ export function drawing(name, attributes = {}, ...children) {
   return fill(document.createElementNS(SVG, name), attributes, children);
 }
 
+/** A number of things. */
+export function count(number, thing) {
+  return `${number} ${thing}${number === 1 ? '' : 's'}`;
+}
+
 /** A link to a view. */
 export function link(view, name, text = name) {
   return element('a', { href: `#/${view}/${encodeURIComponent(name)}` }, text);

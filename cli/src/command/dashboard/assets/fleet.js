@@ -1,11 +1,16 @@
 // Hosts with their agents, and one agent.
 
-import { clock, element, link, longTable, problems, rate, seconds, span, table } from './elements.js';
+import { clock, count, element, link, longTable, problems, rate, seconds, span, table } from './elements.js';
 import { chart } from './chart.js';
 import { coalitions, members } from './coalitions.js';
 import { conversationTable } from './conversations.js';
 import { letterTable } from './letters.js';
 import { offers } from './offers.js';
+
+/** Median time of letters to another host from which a link counts as slow, in microseconds. */
+const SLOW = 100_000;
+/** Maximum number of ended agents above the hosts. */
+const MAX_ENDED = 5;
 
 const COLUMNS = [
   { title: 'Agent' },
@@ -36,7 +41,7 @@ function aboutLink(host) {
   if (host.transports.length) parts.push(host.transports.join(', '));
   if (host.encrypted !== null) parts.push(host.encrypted ? 'encrypted' : 'not encrypted');
   if (host.median_us !== null) parts.push(`letters take ${span(host.median_us)} (99 %: ${span(host.p99_us)})`);
-  if (host.retries > 0) parts.push(`${host.retries} failed attempts`);
+  if (host.retries > 0) parts.push(count(host.retries, 'failed attempt'));
   return parts.join(' · ');
 }
 
@@ -56,7 +61,7 @@ class HostCard {
   show(host, rows) {
     const lost = host && host.state !== 'connected';
     this.node.classList.toggle('lost', Boolean(lost));
-    this.state.className = lost ? 'bad-text' : '';
+    this.state.className = lost || host?.median_us >= SLOW ? 'bad-text' : '';
     let text = this.isOwn ? 'the gateway of this page' : 'known without a connection';
     if (lost) text = host.state === 'lost' ? `LOST ${seconds(host.seconds)} ago` : 'does not answer';
     else if (host) text = aboutLink(host);
@@ -72,15 +77,34 @@ function totals(values) {
     ['Agents', values.agents_here + values.agents_elsewhere],
     ['Letters/s', rate(values.letters_per_second)],
     ['Delivery', span(values.median_us) || '–'],
-    ['Failed', values.failures, values.failures > 0],
-    ['Violations', values.violations, values.violations > 0],
+    ['Not delivered', values.failures, 'letters'],
+    ['Violations', values.violations, 'conversations'],
   ];
-  return shown.map(([name, value, isBad]) => element('div', {},
-    element('dt', {}, name), element('dd', { class: isBad ? 'bad-text' : null }, String(value))));
+  return shown.map(([name, value, view]) => {
+    const text = view && value > 0 ? element('a', { href: `#/${view}`, class: 'bad-text' }, String(value)) : String(value);
+    return element('div', {}, element('dt', {}, name), element('dd', {}, text));
+  });
+}
+
+/** Hosts that are lost or slow, and agents that have ended, except commands of fipa. */
+function alerts(hosts, agents) {
+  const all = [];
+  for (const [name, host] of Object.entries(hosts)) {
+    if (host.state !== 'connected') all.push([`${name} `, host.state === 'lost' ? `is lost since ${seconds(host.seconds)}` : 'does not answer']);
+    else if (host.median_us >= SLOW) all.push([`Letters to ${name} are slow: they take ${span(host.median_us)}`]);
+  }
+  const ended = Object.values(agents).filter((row) => row.ended && !row.type?.startsWith('fipa-'));
+  ended.sort((a, b) => (a.ended < b.ended ? 1 : -1));
+  for (const row of ended.slice(0, MAX_ENDED)) {
+    all.push([link('agent', row.name), ` on ${row.here ? 'this host' : row.host ?? 'another host'} ended ${clock(row.ended)}`]);
+  }
+  if (ended.length > MAX_ENDED) all.push([`${ended.length - MAX_ENDED} more agents ended`]);
+  return all.map((parts) => element('li', {}, ...parts));
 }
 
 export function fleet() {
   const numbers = element('dl', { class: 'totals' });
+  const problemList = element('ul', { class: 'card alerts', 'aria-label': 'Problems' });
   const rates = chart();
   const hosts = element('div', { class: 'hosts' });
   const groups = coalitions();
@@ -90,6 +114,11 @@ export function fleet() {
     if (values?.host === undefined) return;
     document.getElementById('title').textContent = `${values.domain} on ${values.host}`;
     numbers.replaceChildren(...totals(values));
+    const found = alerts(peers, agents);
+    problemList.hidden = found.length === 0;
+    const isShown = found.length === problemList.childElementCount
+      && found.every((item, index) => item.isEqualNode(problemList.children[index]));
+    if (!isShown) problemList.replaceChildren(...found);
     rates.show(history);
     const own = values.gateway ?? values.host;
     groups.show(agents, own);
@@ -116,7 +145,7 @@ export function fleet() {
       }
     }
   };
-  return { node: element('div', {}, numbers, rates.node, groups.node, hosts), path: 'fleet', update };
+  return { node: element('div', {}, numbers, problemList, rates.node, groups.node, hosts), path: 'fleet', update };
 }
 
 const PERFORMATIVES = ['request', 'inform', 'query-ref', 'query-if', 'cancel', 'subscribe', 'cfp', 'accept-proposal',

@@ -1,6 +1,6 @@
 // The newest letters, with their ways.
 
-import { clock, element, link, table } from './elements.js';
+import { clock, count, element, link, table } from './elements.js';
 
 const COLUMNS = [
   { title: 'Time' }, { title: 'From' }, { title: 'To' }, { title: 'Message' }, { title: 'Way', class: 'optional' },
@@ -15,7 +15,7 @@ function outcome(fate) {
   const text = element('span', { class: fate.outcome === 'failed' ? 'bad-text' : null },
     fate.reason ? `${fate.outcome}: ${fate.reason}` : OUTCOMES[fate.outcome] ?? fate.outcome);
   return attempts.length === 0 ? [text]
-    : [text, element('details', {}, element('summary', {}, `${attempts.length} failed attempts`), element('ul', {}, attempts))];
+    : [text, element('details', {}, element('summary', {}, count(attempts.length, 'failed attempt')), element('ul', {}, attempts))];
 }
 
 function letterRow(row) {

@@ -100,5 +100,8 @@ async function start() {
   else show();
 }
 
-addEventListener('hashchange', show);
+addEventListener('hashchange', () => {
+  show();
+  scrollTo(0, 0);
+});
 start();
