@@ -166,12 +166,22 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        if !self.session.is_empty() && !std::thread::panicking() {
-            let request = format!(
-                "DELETE {} HTTP/1.1\r\nHost: {}\r\n",
-                self.session, self.address
-            );
-            self.exchange(&format!("{request}\r\n"));
+        if self.session.is_empty() {
+            return;
+        }
+        // The browser ends with its session, also after a failure. A second failure would end the other tests.
+        let end = || -> std::io::Result<()> {
+            let mut stream = TcpStream::connect(self.address)?;
+            stream.set_read_timeout(Some(WATCHDOG))?;
+            let (session, address) = (&self.session, self.address);
+            write!(
+                stream,
+                "DELETE {session} HTTP/1.1\r\nHost: {address}\r\n\r\n"
+            )?;
+            stream.read_exact(&mut [0])
+        };
+        if let Err(error) = end() {
+            println!("cannot end the browser: {error}");
         }
     }
 }
