@@ -169,7 +169,7 @@ impl Drop for Browser {
         if self.session.is_empty() {
             return;
         }
-        // The browser ends with its session, also after a failure. A second failure would end the other tests.
+        // The browser ends with its session, also after a failure. A panic during another one would end all tests.
         let end = || -> std::io::Result<()> {
             let mut stream = TcpStream::connect(self.address)?;
             stream.set_read_timeout(Some(WATCHDOG))?;
@@ -180,8 +180,9 @@ impl Drop for Browser {
             )?;
             stream.read_exact(&mut [0])
         };
-        if let Err(error) = end() {
-            println!("cannot end the browser: {error}");
+        let ended = end();
+        if !std::thread::panicking() {
+            ended.unwrap();
         }
     }
 }
