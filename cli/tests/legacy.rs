@@ -179,7 +179,9 @@ fn failure_messages_beyond_a_limit_are_counted_in_the_log() {
         // The gateway closes the connection after it has read the letter.
         let _ = stream.read_to_end(&mut Vec::new());
     }
-    gateway.wait_for_log(&["failure messages beyond a limit to one sender become one message"]);
+    gateway.wait_for_log(&[
+        "failure messages beyond a limit are counted in one message to their sender",
+    ]);
     // The gateway logs the number at its end at the latest.
     let (_, log) = gateway.signal("-INT");
     assert!(log.contains("omitted="), "{log}");

@@ -52,7 +52,7 @@ impl Contacts for Publishing {
 
     fn took(&self, _: &str, _: &Location) {}
 
-    fn publish(&self) {
+    fn publish(&self) -> bool {
         let service = self.service.get().unwrap().clone();
         let (ended, end) = mpsc::channel();
         thread::spawn(move || {
@@ -62,6 +62,7 @@ impl Contacts for Publishing {
         let waited = end.recv_timeout(TIMEOUT);
         waited.expect("the service is locked while contacts are published");
         self.events.lock().push(Event::Published);
+        true
     }
 
     fn suspect(&self, _: &Location, _: TransportErrorKind) {}

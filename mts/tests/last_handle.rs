@@ -35,7 +35,9 @@ impl Contacts for Halting {
 
     fn took(&self, _: &str, _: &Location) {}
 
-    fn publish(&self) {}
+    fn publish(&self) -> bool {
+        true
+    }
 
     fn suspect(&self, _: &Location, _: TransportErrorKind) {}
 

@@ -60,13 +60,15 @@ impl DirectorySync {
     }
 
     /// Publishes the agents of other hosts because a letter is about to be handed to an agent that may reply. In a
-    /// flood of such letters, the task does it after its pause.
-    pub(super) fn publish_for_letter(&self) {
+    /// flood of such letters, the task does it after its pause. Returns whether they are published.
+    pub(super) fn publish_for_letter(&self) -> bool {
         let mut published = self.published.lock();
-        let is_published = *published == Some(self.generations());
-        if !is_published && self.pace.lock().may_hurry(Instant::now()) {
+        let wanted = self.generations();
+        let is_published = |published: Option<[u64; 2]>| published == Some(wanted);
+        if !is_published(*published) && self.pace.lock().may_hurry(Instant::now()) {
             self.publish_now(&mut published);
         }
+        is_published(*published)
     }
 
     /// The generations of the directories with the agents of other hosts.

@@ -835,11 +835,9 @@ impl Contacts for KnownPeers {
         self.takers.took(now, location);
     }
 
-    fn publish(&self) {
+    fn publish(&self) -> bool {
         let publisher = self.publisher.lock().clone();
-        if let Some(publisher) = publisher {
-            publisher.publish_for_letter();
-        }
+        publisher.is_some_and(|publisher| publisher.publish_for_letter())
     }
 
     fn suspect(&self, location: &Location, fault: TransportErrorKind) {

@@ -3,25 +3,25 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::net::IpAddr;
+use std::ops::Bound;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{FailureReason, quota_address};
 
 use super::ids::LaneId;
-use super::lane::OpenLetter;
+use super::lane::{LETTER_BYTES, OpenLetter};
 use super::lanes::LANES_AT_ONCE;
-use super::origin::Origin;
+use super::origin::{Origin, Settlement};
 use super::undelivered::{FailureTarget, Undelivered};
-use super::{Core, CoreConfig, News, Now, failed_for, work};
+use super::{Core, CoreConfig, Now, failed_for, work};
 use crate::Map;
 
-/// Time between two visits of the lanes with a backlog. Room in a lane is used at once, and room that letters for
-/// other receivers leave, at the next visit.
+/// Time between two visits of the lanes with a backlog. Room in its own lane is used at once, and room in the custody
+/// at the next visit.
 const VISITED_EVERY: Duration = Duration::from_millis(100);
 /// Maximum number of letters of one lane that leave the backlog in one call.
 const LEAVE_AT_ONCE: usize = 64;
-/// Minimum number of bytes that a letter counts as: its state takes about as much memory.
-const LETTER_BYTES: usize = 1536;
 
 /// The letters that wait for room in their lanes.
 #[derive(Debug, Default)]
@@ -102,20 +102,20 @@ impl Backlog {
         if self.due().is_none_or(|due| now < due) {
             return Vec::new();
         }
-        let is_later = |lane: &LaneId| self.visited.is_none_or(|visited| *lane > visited);
-        let all = || self.lanes.keys().copied();
-        let later = all()
-            .filter(is_later)
-            .chain(all().filter(|lane| !is_later(lane)));
-        let lanes: Vec<LaneId> = later.take(LANES_AT_ONCE).collect();
-        work::steps(self.lanes.len());
+        let begin = self.visited.map_or(Bound::Unbounded, Bound::Excluded);
+        let later = self.lanes.range((begin, Bound::Unbounded));
+        let earlier = self.visited.map(|visited| self.lanes.range(..=visited));
+        let lanes = later.chain(earlier.into_iter().flatten());
+        let lanes: Vec<LaneId> = lanes.map(|(lane, _)| *lane).take(LANES_AT_ONCE).collect();
+        work::steps(lanes.len());
         self.visited = lanes.last().copied();
         self.next_visit = Some(now + VISITED_EVERY);
         lanes
     }
 
-    pub(super) fn clear(&mut self) {
-        *self = Self::default();
+    /// Bytes of the letters.
+    pub(super) fn bytes(&self) -> usize {
+        self.bytes
     }
 }
 
@@ -138,7 +138,7 @@ impl Core {
         }
         let config = &self.table.config;
         if let Err(letter) = self.backlog.push(now.instant, lane, (from, letter), config) {
-            self.fail_unframed(lane, &letter);
+            self.fail_unframed(now, lane, letter, FailureReason::QueueFull);
         }
     }
 
@@ -150,14 +150,18 @@ impl Core {
     /// Moves letters from the backlog into their lane while it has room, and ends those whose deadlines have passed.
     pub(super) fn relieve(&mut self, now: Now, lane: LaneId) {
         let mut has_more = false;
-        for _ in 0..LEAVE_AT_ONCE {
+        for number in 0.. {
             if !self.backlog.has_any_of(lane) {
+                break;
+            }
+            if number == LEAVE_AT_ONCE {
+                self.backlog.next_visit = Some(now.instant);
                 break;
             }
             work::steps(1);
             let is_late = |letter: &OpenLetter| letter.deadline <= now.instant;
             if let Some(letter) = self.backlog.pop_if(lane, is_late) {
-                self.fail_unframed(lane, &letter);
+                self.fail_unframed(now, lane, letter, FailureReason::QueueFull);
                 continue;
             }
             let state = self.lanes.get(&lane);
@@ -186,35 +190,55 @@ impl Core {
         }
     }
 
-    fn fail_unframed(&mut self, lane: LaneId, letter: &OpenLetter) {
-        let Some(lane) = self.lanes.get(&lane) else {
+    /// Fails all letters, because the service ends. Their senders get no message.
+    pub(super) fn end_backlog(&mut self, now: Now) {
+        while let Some(lane) = self.backlog.lanes.keys().next().copied() {
+            while let Some(letter) = self.backlog.pop_if(lane, |_| true) {
+                self.settle_unframed(now, lane, letter, FailureReason::Closed);
+            }
+        }
+    }
+
+    fn fail_unframed(
+        &mut self,
+        now: Now,
+        lane: LaneId,
+        letter: Box<OpenLetter>,
+        reason: FailureReason,
+    ) {
+        let origin = match &letter.origin {
+            Origin::LegacyPeer { from, failed } => failed.clone().map(|failed| (*from, failed)),
+            _ => None,
+        };
+        let content = letter.letter.clone();
+        let Some(receiver) = self.settle_unframed(now, lane, letter, reason) else {
             return;
         };
-        let (stream, receiver) = (lane.stream_of(letter), lane.receiver());
-        let reason = FailureReason::QueueFull;
-        self.table
-            .notice(stream, letter.sequence, &receiver, || News::Settled {
-                outcome: failed_for(reason),
-                sender: true,
+        if let Some((from, failed)) = origin {
+            self.table.undelivered.push_back(Undelivered {
+                sender: FailureTarget::LegacyPeer { from, failed },
+                receiver,
+                letter: content,
+                reason,
+                detail: String::new(),
+                count: 1,
             });
-        let Origin::LegacyPeer {
-            from,
-            failed: Some(failed),
-        } = &letter.origin
-        else {
-            return;
-        };
-        let sender = FailureTarget::LegacyPeer {
-            from: *from,
-            failed: failed.clone(),
-        };
-        self.table.undelivered.push_back(Undelivered {
-            sender,
-            receiver,
-            letter: letter.letter.clone(),
-            reason,
-            detail: String::new(),
-            count: 1,
-        });
+        }
+    }
+
+    /// Reports the end of a letter, and returns its receiver.
+    fn settle_unframed(
+        &mut self,
+        now: Now,
+        lane: LaneId,
+        letter: Box<OpenLetter>,
+        reason: FailureReason,
+    ) -> Option<Arc<str>> {
+        let lane = self.lanes.get(&lane)?;
+        let (stream, receiver) = (lane.stream_of(&letter), lane.receiver());
+        let ended = Settlement::Outcome(failed_for(reason));
+        self.table
+            .settle(now.instant, letter, stream, Arc::clone(&receiver), ended);
+        Some(receiver)
     }
 }

@@ -75,8 +75,8 @@ impl Core {
     /// another location, so that it can be answered. Returns whether it did.
     ///
     /// # Errors
-    /// If too many agents have become known by their letters. A gateway announces its agents, so the directory may have
-    /// this one soon.
+    /// If too many agents have become known by their letters. A gateway announces its agents, so the directory may soon
+    /// list the sender.
     pub(super) fn report_contact(
         &mut self,
         now: Instant,
@@ -120,9 +120,11 @@ impl Core {
         let address = from.location.authority().parse::<SocketAddr>();
         let address = address.ok().map(|it| it.ip().to_canonical());
         if !self.contact_limit.take(now, address, &name) {
+            tracing::debug!(at = %from.location, %name, "rate limit of new agents exceeded");
             return Err(TooManyContacts);
         }
         let location = from.location.clone();
+        self.is_ahead = true;
         self.table.actions.push_back(Action::ContactSeen {
             name,
             agent,
@@ -166,6 +168,7 @@ impl Core {
             tracing::debug!(%from, "rate limit of new agents of legacy peers exceeded; this one cannot be answered");
             return false;
         }
+        self.is_ahead = true;
         self.table.actions.push_back(Action::ContactSeen {
             name,
             agent: Incarnation::UNKNOWN,

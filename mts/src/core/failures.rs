@@ -118,7 +118,7 @@ impl Core {
                         if of.is_some_and(|of| self.summaries.add(now.instant, of, later)) {
                             log_limit::warn!(
                                 of: address.map(quota_address),
-                                "failure messages beyond a limit to one sender become one message"
+                                "failure messages beyond a limit are counted in one message to their sender"
                             );
                         } else {
                             log_omitted(address);

@@ -163,8 +163,9 @@ impl Core {
         work::steps(self.lanes.len());
         let ids = &mut self.lane_ids;
         let order = &mut self.lane_order;
+        let backlog = &self.backlog;
         self.lanes.retain(|id, lane| {
-            let goes = forget(lane);
+            let goes = forget(lane) && !backlog.has_any_of(*id);
             if goes {
                 ids.remove(lane.key());
                 order.remove(id);
@@ -173,15 +174,16 @@ impl Core {
         });
     }
 
-    /// Whether another letter of this process can wait in this lane.
-    pub(super) fn has_room_to_wait(&self, now: Now, lane: LaneId, len: usize) -> bool {
-        let lane = self.lanes.get(&lane);
+    /// Whether another letter of this process can wait in this lane. Letters in the backlog of the lane go first.
+    pub(super) fn has_room_to_wait(&self, now: Now, id: LaneId, len: usize) -> bool {
+        let lane = self.lanes.get(&id).filter(|_| !self.backlog.has_any_of(id));
         lane.is_some_and(|lane| lane.has_room_to_wait(now.instant, len, &self.table))
     }
 
-    /// Whether this lane has room for a letter whose sender cannot be held back.
-    pub(super) fn has_room_for_stranger(&self, lane: LaneId, len: usize) -> bool {
-        let lane = self.lanes.get(&lane);
+    /// Whether this lane has room for a letter whose sender cannot be held back. Letters in the backlog of the lane go
+    /// first.
+    pub(super) fn has_room_for_stranger(&self, id: LaneId, len: usize) -> bool {
+        let lane = self.lanes.get(&id).filter(|_| !self.backlog.has_any_of(id));
         lane.is_some_and(|lane| {
             lane.has_room(len, &self.table) && lane.fits_into_custody(len, &self.table)
         })

@@ -291,6 +291,12 @@ impl Core {
         std::mem::replace(&mut self.table.view, view)
     }
 
+    /// Whether the view may have agents of other hosts that the processes of this host do not see yet.
+    #[must_use]
+    pub fn is_ahead(&self) -> bool {
+        self.is_ahead
+    }
+
     /// Records that the processes of this host see all agents of other hosts in the view.
     pub fn handle_published(&mut self) {
         self.is_ahead = false;
@@ -452,7 +458,8 @@ impl Core {
         self.closed = true;
         self.ending = true;
         self.fail_waiting(|_| true, FailureReason::Closed);
-        self.backlog.clear();
+        self.end_backlog(now);
+        self.summaries = Summaries::default();
         for id in self.lanes_in_order() {
             if let Some(lane) = self.lanes.get_mut(&id) {
                 lane.give_up(now.instant, &mut self.table);

@@ -178,7 +178,7 @@ impl Core {
     /// Returns the bytes of the letters that have no outcome yet: at a gateway, those in custody.
     #[must_use]
     pub fn held_bytes(&self) -> usize {
-        self.table.custody.held()
+        self.table.custody.held() + self.backlog.bytes()
     }
 
     /// Returns the counters of each location, sorted by location.

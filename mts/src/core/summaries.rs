@@ -16,6 +16,8 @@ use crate::failure::Failed;
 const AFTER: Duration = Duration::from_secs(1);
 /// Maximum number of senders with a summary.
 const MAX_SENDERS: usize = 256;
+/// Maximum number of them at one address.
+const MAX_OF_ADDRESS: usize = 32;
 /// Maximum number of summaries that one call sends.
 const AT_ONCE: usize = 16;
 
@@ -45,7 +47,10 @@ impl Summaries {
             summary.first.count = summary.first.count.saturating_add(undelivered.count);
             return true;
         }
-        if self.0.len() >= MAX_SENDERS {
+        let of_address = self.0.range((sender.0, String::new())..);
+        let of_address = of_address.take_while(|((address, _), _)| *address == sender.0);
+        if self.0.len() >= MAX_SENDERS || of_address.take(MAX_OF_ADDRESS).count() == MAX_OF_ADDRESS
+        {
             return false;
         }
         let first = Undelivered {

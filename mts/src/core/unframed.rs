@@ -396,7 +396,7 @@ impl Core {
         let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
         let until = now.instant + deadline.min(MAX_DEADLINE);
         let failed = failed.clone();
-        if *is_contact {
+        if *is_contact || self.is_ahead {
             self.await_publication(lane);
         }
         let address = from.address;

@@ -88,8 +88,9 @@ pub trait Contacts: Send + Sync {
     fn took(&self, name: &str, location: &Location);
 
     /// Publishes the agents of other hosts, also those of [`contact_seen`](Self::contact_seen), to the processes of this
-    /// host, unless they see them. Called without the service locked, because it may write files.
-    fn publish(&self);
+    /// host, unless they see them. Returns whether they see all of them. Called without the service locked, because it
+    /// may write files.
+    fn publish(&self) -> bool;
 
     /// A service may be gone; see [`Action::Suspect`].
     fn suspect(&self, location: &Location, fault: TransportErrorKind);
@@ -184,8 +185,8 @@ struct Shared {
 /// Work that actions of the core leave to be done without the lock.
 #[derive(Default)]
 struct Unlocked {
-    /// Generation of the directory whose view the core has.
-    generation: u64,
+    /// Generation of the directory whose view the core has, if the processes of this host may not see all of it.
+    ahead: Option<u64>,
     /// Number of the last refresh of the directory that the core has requested.
     refresh: Option<u64>,
 }
@@ -749,13 +750,14 @@ impl Shared {
     ) {
         let mut rest = self.perform(guard, release);
         while let Some(number) = rest.refresh {
-            if let Some(contacts) = &self.config.contacts {
-                contacts.publish();
-            }
+            let contacts = self.config.contacts.as_ref();
+            let published = rest
+                .ahead
+                .filter(|_| contacts.is_some_and(|it| it.publish()));
             self.directory.refresh();
             let mut state = self.lock();
             let now = state.clocks.now();
-            if state.generation == rest.generation {
+            if published == Some(state.generation) {
                 state.core.handle_published();
             }
             state.core.handle_refreshed(now, number);
@@ -867,7 +869,7 @@ impl Shared {
                 }
             }
         }
-        rest.generation = state.generation;
+        rest.ahead = state.core.is_ahead().then_some(state.generation);
         let due = state.core.poll_timeout();
         let earlier = due.is_some_and(|due| state.armed.is_none_or(|armed| due < armed));
         let replaced = std::mem::take(&mut state.replaced);

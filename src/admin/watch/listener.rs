@@ -30,8 +30,9 @@ pub(super) enum ProcessEvent {
 const MAX_PROCESSES: usize = 1024;
 /// Maximum number of records in one event.
 const MAX_BATCH: usize = 256;
-/// Time between two looks into the socket of a process that sends. The socket has room for the records of many
-/// thousands of letters a second during this time.
+/// Bytes of records after which a batch ends. The socket has more, so the next look follows at once.
+const BATCH_BYTES: usize = 64 * 1024;
+/// Time between two looks into the socket of a process that sends less.
 const INTERVAL: Duration = Duration::from_millis(10);
 
 /// Accepts processes and forwards their events, until it is aborted.
@@ -115,14 +116,14 @@ async fn forward(
         loop {
             let mut records = Vec::new();
             let read = take_records(&socket, &mut buffer, &mut records);
-            let (is_idle, is_full) = (records.is_empty(), records.len() >= MAX_BATCH);
+            let is_idle = records.is_empty();
             if !is_idle {
                 send(ProcessEvent::Records(source, records)).await?;
             }
             match read {
                 Batch::End => return send(ProcessEvent::End(source)).await,
                 Batch::Malformed(why) => return send(ProcessEvent::Malformed(source, why)).await,
-                Batch::Open if is_full => tokio::task::yield_now().await,
+                Batch::Full => tokio::task::yield_now().await,
                 Batch::Open if is_idle => break,
                 Batch::Open => tokio::time::sleep(INTERVAL).await,
             }
@@ -137,13 +138,16 @@ async fn forward(
 /// State of a connection after reading the records that are there.
 enum Batch {
     Open,
+    /// There may be more records.
+    Full,
     End,
     Malformed(RecordError),
 }
 
 /// Takes the records that are there, up to the maximum of a batch.
 fn take_records(socket: &UnixDatagram, buffer: &mut [u8], records: &mut Vec<Record>) -> Batch {
-    while records.len() < MAX_BATCH {
+    let mut taken = 0;
+    while records.len() < MAX_BATCH && taken < BATCH_BYTES {
         let bytes = match socket.recv(buffer) {
             // Records are never empty, so an empty one is the end of the connection.
             Ok(0) => return Batch::End,
@@ -152,10 +156,11 @@ fn take_records(socket: &UnixDatagram, buffer: &mut [u8], records: &mut Vec<Reco
             Err(error) if error.kind() == ErrorKind::Interrupted => continue,
             Err(_) => return Batch::End,
         };
+        taken += bytes.len();
         match Record::parse(&Bytes::copy_from_slice(bytes)) {
             Ok(record) => records.push(record),
             Err(why) => return Batch::Malformed(why),
         }
     }
-    Batch::Open
+    Batch::Full
 }

@@ -78,7 +78,7 @@ const KIND_TIMEOUT: Duration = Duration::from_secs(2);
 const LANE_BYTES: usize = 2560;
 /// Minimum number of bytes that a letter counts as there. Its state, its stamp and the header of its parcel take
 /// about as much memory, and peers can send letters of 71 bytes.
-const LETTER_BYTES: usize = 1536;
+pub(super) const LETTER_BYTES: usize = 1536;
 /// Maximum number of letters that one visit of a lane ends or answers for because of a timeout, or because their
 /// receiver has left. The next visit follows at once.
 const ENDED_AT_ONCE: usize = 64;
