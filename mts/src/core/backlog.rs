@@ -138,7 +138,7 @@ impl Core {
         }
         let config = &self.table.config;
         if let Err(letter) = self.backlog.push(now.instant, lane, (from, letter), config) {
-            self.fail_unframed(now, lane, letter, FailureReason::QueueFull);
+            self.fail_unframed(now, lane, letter);
         }
     }
 
@@ -161,7 +161,7 @@ impl Core {
             work::steps(1);
             let is_late = |letter: &OpenLetter| letter.deadline <= now.instant;
             if let Some(letter) = self.backlog.pop_if(lane, is_late) {
-                self.fail_unframed(now, lane, letter, FailureReason::QueueFull);
+                self.fail_unframed(now, lane, letter);
                 continue;
             }
             let state = self.lanes.get(&lane);
@@ -199,13 +199,8 @@ impl Core {
         }
     }
 
-    fn fail_unframed(
-        &mut self,
-        now: Now,
-        lane: LaneId,
-        letter: Box<OpenLetter>,
-        reason: FailureReason,
-    ) {
+    fn fail_unframed(&mut self, now: Now, lane: LaneId, letter: Box<OpenLetter>) {
+        let reason = FailureReason::QueueFull;
         let origin = match &letter.origin {
             Origin::LegacyPeer { from, failed } => failed.clone().map(|failed| (*from, failed)),
             _ => None,
