@@ -63,14 +63,15 @@ fn row(goal: &RunningGoal) -> (String, Value) {
         may_cancel,
     } = goal;
     let progress = status.progress.as_ref();
-    let key = format!("{robot} {} {}", status.client, status.goal);
+    let key = json!([robot, status.client, status.goal]).to_string();
+    // An order to cancel needs the whole names.
     let row = json!({
-        "robot": robot, "goal": clipped(&status.goal), "action": clipped(&status.action),
-        "client": clipped(&status.client), "state": status.state.as_str(), "since": moment(*since),
+        "robot": robot, "goal": status.goal, "action": clipped(&status.action), "client": status.client,
+        "state": status.state.as_str(), "since": moment(*since),
         "fraction": progress.and_then(|it| it.fraction), "note": progress.and_then(|it| it.note.as_deref()).map(clipped),
         "answered": is_answered, "may_cancel": may_cancel,
     });
-    (clipped(&key), row)
+    (key, row)
 }
 
 /// The object of a goal that a client of the page has cancelled.
