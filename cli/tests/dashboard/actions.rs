@@ -110,7 +110,7 @@ fn a_running_action_is_seen_and_cancelled_from_the_page() {
             browser.wait_for("drive of crex: cancelled by the operator dashboard@base");
             // All pages see it, and by which agent.
             until("the row of the cancelled goal", || {
-                let wanted = |row: &String| row.contains("dashboard@base");
+                let wanted = |row: &String| row.contains("by the operator dashboard@base");
                 rows(browser).iter().any(wanted)
             });
             assert_eq!(browser.value("document.documentElement.scrollWidth"), 390);

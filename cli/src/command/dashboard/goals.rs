@@ -41,14 +41,18 @@ pub(super) struct RunningGoal {
     pub(super) may_cancel: Option<bool>,
 }
 
-/// A goal that a client of the page has cancelled.
+/// A goal that a client of the page cancels.
 #[derive(Debug)]
 pub(super) struct Cancelled {
+    pub(super) number: u64,
     pub(super) at: SystemTime,
     /// The agent of the page.
     pub(super) by: String,
     pub(super) robot: String,
-    pub(super) status: GoalStatus,
+    pub(super) goal: String,
+    pub(super) client: String,
+    /// The end of the goal, or why it is not known; `None` while the robot is asked.
+    pub(super) outcome: Option<Result<GoalStatus, String>>,
 }
 
 /// The agents that may run goals, by name.

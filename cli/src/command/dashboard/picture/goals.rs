@@ -1,4 +1,4 @@
-//! The goals that agents run, and those that a client of the page has cancelled.
+//! The goals that agents run, and those that a client of the page cancels.
 
 use std::collections::VecDeque;
 
@@ -20,7 +20,6 @@ pub(in crate::command::dashboard) struct Goals {
     running: Vec<(String, Value)>,
     /// The newest last, each with its number.
     cancelled: VecDeque<(u64, Value)>,
-    next: u64,
 }
 
 impl Goals {
@@ -29,14 +28,18 @@ impl Goals {
         self.running = running.iter().take(MAX_GOALS).map(row).collect();
     }
 
-    /// Takes a goal that a client of the page has cancelled.
-    pub(in crate::command::dashboard) fn add_cancelled(&mut self, cancelled: &Cancelled) {
+    /// Takes a goal that a client of the page cancels, or its outcome.
+    pub(in crate::command::dashboard) fn put_cancelled(&mut self, cancelled: &Cancelled) {
+        let row = cancelled_object(cancelled);
+        let mut known = self.cancelled.iter_mut();
+        if let Some((_, known)) = known.find(|(number, _)| *number == cancelled.number) {
+            *known = row;
+            return;
+        }
         if self.cancelled.len() >= MAX_CANCELLED {
             self.cancelled.pop_front();
         }
-        self.cancelled
-            .push_back((self.next, cancelled_object(cancelled)));
-        self.next += 1;
+        self.cancelled.push_back((cancelled.number, row));
     }
 
     /// Adds the rows.
@@ -74,17 +77,29 @@ fn row(goal: &RunningGoal) -> (String, Value) {
     (key, row)
 }
 
-/// The object of a goal that a client of the page has cancelled.
+/// The object of a goal that a client of the page cancels.
 pub(in crate::command::dashboard) fn cancelled_object(cancelled: &Cancelled) -> Value {
     let Cancelled {
+        number: _,
         at,
         by,
         robot,
-        status,
+        goal,
+        client,
+        outcome,
     } = cancelled;
+    let (status, reason) = match outcome {
+        Some(Ok(status)) => {
+            let failure = status.failure.as_ref();
+            (Some(status), failure.map(ToString::to_string))
+        }
+        Some(Err(reason)) => (None, Some(reason.clone())),
+        None => (None, None),
+    };
     json!({
-        "time": moment(*at), "by": by, "robot": clipped(robot), "goal": clipped(&status.goal),
-        "action": clipped(&status.action), "client": clipped(&status.client), "state": status.state.as_str(),
-        "reason": status.failure.as_ref().map(|failure| clipped(&failure.to_string())),
+        "time": moment(*at), "by": by, "robot": clipped(robot), "goal": clipped(goal), "client": clipped(client),
+        "action": status.map(|status| clipped(&status.action)),
+        "state": status.map_or("asked", |status| status.state.as_str()),
+        "reason": reason.as_deref().map(clipped),
     })
 }
