@@ -103,3 +103,43 @@ pub(in crate::command::dashboard) fn cancelled_object(cancelled: &Cancelled) -> 
         "reason": reason.as_deref().map(clipped),
     })
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+
+    use std::time::UNIX_EPOCH;
+
+    use super::*;
+
+    fn cancelled(number: u64) -> Cancelled {
+        Cancelled {
+            number,
+            at: UNIX_EPOCH,
+            by: "dashboard@base".to_owned(),
+            robot: "crex".to_owned(),
+            goal: format!("g-{number}"),
+            client: "rover".to_owned(),
+            outcome: None,
+        }
+    }
+
+    #[test]
+    fn the_last_cancels_are_listed_from_their_begin_and_once() {
+        let mut goals = Goals::default();
+        for number in 0..=20 {
+            goals.put_cancelled(&cancelled(number));
+        }
+        let newest = |goals: &Goals| goals.cancelled.back().unwrap().1.clone();
+        assert_eq!(goals.cancelled.len(), MAX_CANCELLED);
+        assert_eq!(newest(&goals)["state"], "asked");
+        assert_eq!(newest(&goals)["reason"], Value::Null);
+        goals.put_cancelled(&Cancelled {
+            outcome: Some(Err("no answer".to_owned())),
+            ..cancelled(20)
+        });
+        assert_eq!(goals.cancelled.len(), MAX_CANCELLED);
+        assert_eq!(newest(&goals)["goal"], "g-20");
+        assert_eq!(newest(&goals)["reason"], "no answer");
+    }
+}
