@@ -240,6 +240,10 @@ fn not_served(error: &WebError) -> Failure {
             "http.listen",
             "use a loopback address of this machine and a port that this user may open",
         ),
+        WebError::NoKey { .. } => (
+            "http.listen",
+            "set security.keys, or use a loopback address, for example 127.0.0.1:9790",
+        ),
         _ => (
             "http.token_file",
             "give a file in a directory to which only the user of the gateway can write; if it is missing, the \

@@ -249,6 +249,11 @@ pub(crate) fn rfc3339(time: SystemTime) -> Option<String> {
     Time::from_system_time(time).ok().and_then(Time::to_rfc3339)
 }
 
+/// Returns a time in UTC as in RFC 3339; empty if it is out of the range of that.
+pub(crate) fn moment(time: SystemTime) -> String {
+    rfc3339(time).unwrap_or_default()
+}
+
 /// Returns the name of this host.
 pub(crate) fn host_name() -> String {
     let name = rustix::system::uname();

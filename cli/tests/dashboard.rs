@@ -719,6 +719,28 @@ fn clients_send_messages_only_with_control_and_as_an_agent_of_the_host() {
     assert_no_messages(&browser);
 }
 
+#[test]
+fn another_agent_with_the_name_of_the_page_ends_no_observation() {
+    let host = Host::new();
+    let namesake = host.echo("dashboard@base");
+    let shown = Shown::start(
+        &host,
+        "127.0.0.1:0",
+        &["http.control=true", "mts.name=base"],
+    );
+    let mut fleet = shown.follow("fleet");
+    let _ = fleet.event("snapshot");
+    fleet.change("agents", "dashboard@base", |row| {
+        row["here"] == true && row["type"] != "fipa-dashboard"
+    });
+    // The page takes the name as soon as it is free.
+    let ended = namesake.signal("-INT");
+    assert_eq!(ended.0, Some(0), "{ended:?}");
+    fleet.change("agents", "dashboard@base", |row| {
+        row["ended"].is_null() && row["type"] == "fipa-dashboard"
+    });
+}
+
 /// The configuration of a process of this host.
 fn config_of(host: &Host) -> fipa::Config {
     let mut config = fipa::Config::for_host("test");

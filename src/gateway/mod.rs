@@ -348,10 +348,13 @@ impl Gateway {
             false => PathBuf::from(&http.token_file),
         };
         let token = Token::load(&token_file).map_err(WebError::Token)?;
-        let encryption = match is_on_loopback(&http.listen) {
-            true => None,
-            false => self.encryption.clone(),
-        };
+        let is_open = !is_on_loopback(&http.listen);
+        let encryption = self.encryption.clone().filter(|_| is_open);
+        if is_open && encryption.is_none() {
+            return Err(WebError::NoKey {
+                address: http.listen.clone(),
+            });
+        }
         let scheme = if encryption.is_some() {
             "https"
         } else {

@@ -14,6 +14,12 @@ pub enum WebError {
         /// The error of the operating system.
         source: std::io::Error,
     },
+    /// Other hosts reach the address, and the gateway has no key to encrypt with.
+    #[error("there is no key to encrypt with at {address} (key http.listen)")]
+    NoKey {
+        /// The address.
+        address: String,
+    },
     /// The token cannot be used.
     #[error(transparent)]
     Token(#[from] TokenError),

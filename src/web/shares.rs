@@ -4,12 +4,14 @@ use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::Arc;
 
+use fipa_transport::quota_address;
 use parking_lot::Mutex;
 
 /// Maximum number of connections of another host at the same time. A further one is closed.
 const MAX_OF_HOST: usize = 12;
 
-/// The open connections by the address of the client.
+/// The open connections by the address of the client. All IPv6 addresses of a network of 64 bits count as
+/// one host.
 #[derive(Debug, Default)]
 pub(super) struct Shares {
     open: Mutex<HashMap<IpAddr, usize>>,
@@ -26,7 +28,7 @@ impl Shares {
     /// Counts a connection of this client; `None` if it has too many. All users of this host have one address, and no
     /// bound of their own.
     pub(super) fn take(self: &Arc<Self>, client: IpAddr) -> Option<Share> {
-        let client = client.to_canonical();
+        let client = quota_address(client);
         let mut open = self.open.lock();
         let count = open.entry(client).or_default();
         if *count >= MAX_OF_HOST && !client.is_loopback() {
@@ -57,6 +59,18 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::*;
+
+    #[test]
+    fn addresses_of_one_ipv6_network_have_one_share() {
+        let shares = Arc::new(Shares::default());
+        let address =
+            |network: u16, host: u16| IpAddr::from([0x2001, 0xdb8, 0, network, 0, 0, 0, host]);
+        let all: Vec<Share> = (1..100)
+            .map_while(|host| shares.take(address(1, host)))
+            .collect();
+        assert_eq!(all.len(), MAX_OF_HOST);
+        assert!(shares.take(address(2, 1)).is_some());
+    }
 
     #[test]
     fn a_host_has_its_share_and_this_host_all() {

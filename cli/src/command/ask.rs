@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Display;
 
-use fipa::{Agent, AgentId, Reach, Role};
+use fipa::{Agent, AgentId, Entry, Reach, Role};
 use fipa_acl::escape_name;
 use tokio::task::JoinSet;
 
@@ -12,14 +12,19 @@ pub(super) fn agents_of_this_host(agent: &Agent) -> Vec<AgentId> {
     let directory = agent.domain().directory();
     directory.refresh();
     let entries = directory.entries();
-    let here = entries.iter().filter(|entry| {
-        entry.role == Role::Agent
-            && entry.reach == Reach::Local
-            && !entry.is_platform_agent()
-            && *entry.name != *agent.name()
-    });
+    let here = entries
+        .iter()
+        .filter(|entry| is_agent_of_this_host(entry, agent));
     here.filter_map(|entry| AgentId::new(&*entry.name).ok())
         .collect()
+}
+
+/// Whether this is an agent of this host, but none of the platform and not the one that asks.
+pub(super) fn is_agent_of_this_host(entry: &Entry, asker: &Agent) -> bool {
+    entry.role == Role::Agent
+        && entry.reach == Reach::Local
+        && !entry.is_platform_agent()
+        && *entry.name != *asker.name()
 }
 
 /// Asks all agents at the same time. Returns the answers by name; `None` of an agent that gave none.

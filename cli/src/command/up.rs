@@ -65,7 +65,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let (dashboard, pages) = Dashboard::start(config)?;
+    let (dashboard, pages) = Dashboard::start(config);
     let opened = Gateway::open_with_pages(config, pages).await;
     let mut gateway = opened.map_err(|error| membership::not_joined(error, config))?;
     let mut problems = gateway.discovery_problem();

@@ -2,6 +2,7 @@
 
 use fipa::Domain;
 use fipa::actions::{Action, Execution, Offer, Progress};
+use serde_json::json;
 use tokio::runtime::Runtime;
 
 use super::*;
@@ -51,7 +52,8 @@ pub(crate) fn drive(host: &Host, robot: &str) -> Running {
 fn goal(shown: &Shown, robot: &str) -> Value {
     let (_, _, body) = shown.ask("GET", "/api/locks", &shown.bearer(), "");
     let view: Value = serde_json::from_str(&body).unwrap();
-    view["goals"][format!("{robot} rover-of-{robot} g-1")].clone()
+    let key = json!([robot, format!("rover-of-{robot}"), "g-1"]).to_string();
+    view["goals"][key].clone()
 }
 
 fn order(robot: &str) -> String {
@@ -108,7 +110,7 @@ fn a_running_action_is_seen_and_cancelled_from_the_page() {
             browser.wait_for("drive of crex: cancelled by the operator dashboard@base");
             // All pages see it, and by which agent.
             until("the row of the cancelled goal", || {
-                let wanted = |row: &String| row.contains("dashboard@base");
+                let wanted = |row: &String| row.contains("by the operator dashboard@base");
                 rows(browser).iter().any(wanted)
             });
             assert_eq!(browser.value("document.documentElement.scrollWidth"), 390);

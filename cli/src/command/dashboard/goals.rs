@@ -3,24 +3,31 @@
 //! Each agent of this host is asked once. Those that offer actions are asked again and again, and so are agents of other
 //! hosts to which a client has sent a goal through this host.
 
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry as Slot;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fipa::actions::{ActionError, GoalRef, GoalStatus, ONTOLOGY, Refusal};
 use fipa::admin::routes::ASKER_TYPE;
 use fipa::admin::watch::Passage;
-use fipa::{Agent, AgentId, Incarnation, Performative, Reach, Role};
+use fipa::{Agent, AgentId, Incarnation, Performative};
 use parking_lot::Mutex;
 
-use crate::command::ask::ask_all;
+use crate::command::ask::{ask_all, is_agent_of_this_host};
 
 /// Maximum wait for the answers of the agents.
 const ANSWER: Duration = Duration::from_secs(2);
 
 /// Maximum number of agents that are asked.
 const MAX_ROBOTS: usize = 2000;
+
+/// Maximum number of goals of a robot. Further ones are left out.
+const MAX_GOALS_OF_ROBOT: usize = 20;
+
+/// Maximum length of the identifier of a goal and of the name of a client, in bytes. Goals with
+/// longer ones are left out: a clipped text does not cancel them.
+const MAX_KEY: usize = AgentId::MAX_NAME;
 
 /// A goal that runs or waits.
 #[derive(Debug)]
@@ -34,14 +41,18 @@ pub(super) struct RunningGoal {
     pub(super) may_cancel: Option<bool>,
 }
 
-/// A goal that a client of the page has cancelled.
+/// A goal that a client of the page cancels.
 #[derive(Debug)]
 pub(super) struct Cancelled {
+    pub(super) number: u64,
     pub(super) at: SystemTime,
     /// The agent of the page.
     pub(super) by: String,
     pub(super) robot: String,
-    pub(super) status: GoalStatus,
+    pub(super) goal: String,
+    pub(super) client: String,
+    /// The end of the goal, or why it is not known; `None` while the robot is asked.
+    pub(super) outcome: Option<Result<GoalStatus, String>>,
 }
 
 /// The agents that may run goals, by name.
@@ -138,12 +149,7 @@ impl Robots {
         let entries: BTreeMap<&str, _> = entries.iter().map(|it| (&*it.name, it)).collect();
         robots.retain(|name, _| entries.contains_key(&**name));
         for (name, entry) in entries {
-            let is_asked = entry.role == Role::Agent
-                && entry.reach == Reach::Local
-                && !entry.is_platform_agent()
-                && *entry.agent_type != *ASKER_TYPE
-                && *name != *agent.name();
-            if !is_asked {
+            if !is_agent_of_this_host(entry, agent) || *entry.agent_type == *ASKER_TYPE {
                 continue;
             }
             let has_room = robots.len() < MAX_ROBOTS;
@@ -188,14 +194,24 @@ impl Robots {
             };
             robot.offers = Some(true);
             let before = std::mem::take(&mut robot.goals);
+            let before: HashMap<(&str, &str), SystemTime> = before
+                .iter()
+                .map(|(since, it)| ((it.client.as_str(), it.goal.as_str()), *since))
+                .collect();
+            let is_short =
+                |status: &GoalStatus| status.goal.len().max(status.client.len()) <= MAX_KEY;
             let began = |status: &GoalStatus| {
-                let known = before.iter().find(|(_, it)| key(it) == key(status));
+                let known = before.get(&(status.client.as_str(), status.goal.as_str()));
                 // Computed once: the age and the clock do not advance at the same rate.
                 let age = Duration::from_millis(status.age);
-                known.map_or_else(|| now.checked_sub(age).unwrap_or(now), |(since, _)| *since)
+                known
+                    .copied()
+                    .unwrap_or_else(|| now.checked_sub(age).unwrap_or(now))
             };
             robot.goals = goals
                 .into_iter()
+                .filter(is_short)
+                .take(MAX_GOALS_OF_ROBOT)
                 .map(|status| (began(&status), status))
                 .collect();
         }
@@ -255,5 +271,57 @@ impl Robots {
             })
         });
         goals.collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+
+    use serde_json::json;
+
+    use super::*;
+
+    fn status(goal: &str, age: u64) -> GoalStatus {
+        let status = json!({
+            "goal": goal, "action": "drive", "client": "rover", "state": "executing", "age": age, "progress": null,
+            "failure": null, "result": null,
+        });
+        serde_json::from_value(status).unwrap()
+    }
+
+    fn robots() -> Robots {
+        let robots = Robots::default();
+        robots.0.lock().insert("crex".to_owned(), Robot::default());
+        robots
+    }
+
+    /// The goals with their begins after this answer of the robot.
+    fn taken(robots: &Robots, answer: Vec<GoalStatus>) -> Vec<(String, SystemTime)> {
+        robots.take(BTreeMap::from([("crex".to_owned(), Some(answer))]));
+        let goals = robots.goals(false).into_iter();
+        goals.map(|it| (it.status.goal, it.since)).collect()
+    }
+
+    #[test]
+    fn of_a_robot_with_any_number_of_goals_the_first_are_kept_with_their_begin() {
+        let robots = robots();
+        let answer = |age| -> Vec<GoalStatus> {
+            (0..1000)
+                .map(|goal| status(&format!("g-{goal}"), age))
+                .collect()
+        };
+        let first = taken(&robots, answer(3_600_000));
+        assert_eq!(first.len(), MAX_GOALS_OF_ROBOT);
+        // Ages of a robot do not move the begin of a goal that is known.
+        assert_eq!(taken(&robots, answer(1)), first);
+    }
+
+    #[test]
+    fn a_goal_with_an_endless_identifier_is_left_out() {
+        let answer = vec![status(&"g".repeat(MAX_KEY + 1), 1), status("g-1", 1)];
+        let goals = taken(&robots(), answer).into_iter();
+        let kept: Vec<String> = goals.map(|(goal, _)| goal).collect();
+        assert_eq!(kept, ["g-1"]);
     }
 }

@@ -25,6 +25,7 @@ use std::sync::Arc;
 use clap::Args;
 use fipa::Config;
 use fipa::admin::routes::HttpListener;
+use fipa::monitor::Library;
 use fipa::web::Pages;
 use fipa_acl::escape;
 use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
@@ -37,7 +38,7 @@ use crate::command::watch::checker;
 use crate::membership;
 use crate::options::Global;
 use crate::output;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 
 /// Show the robots of the domain on a web page of the gateway
 ///
@@ -175,11 +176,8 @@ pub(super) struct Dashboard {
 impl Dashboard {
     /// Starts the dashboard of the gateway with this configuration. Returns its pages, too. Must be called within a
     /// tokio runtime.
-    ///
-    /// # Errors
-    /// Fails if a file of a protocol cannot be read.
-    pub(super) fn start(config: &Config) -> Result<(Self, Pages), Failure> {
-        let library = Arc::new(checker::protocols(&config.monitor.protocols, None)?);
+    pub(super) fn start(config: &Config) -> (Self, Pages) {
+        let library = Arc::new(library(config));
         let observation = Observation::new(Orders::new(config));
         let pages = pages::pages(Arc::clone(&observation), Arc::clone(&library));
         let running = observation::run(Arc::clone(&observation), library, config.clone());
@@ -188,7 +186,7 @@ impl Dashboard {
             observation,
             observing,
         };
-        Ok((dashboard, pages))
+        (dashboard, pages)
     }
 
     /// Stops observing the domain, and leaves it.
@@ -197,4 +195,18 @@ impl Dashboard {
         // A panic of the task has been reported.
         let _ = self.observing.await;
     }
+}
+
+/// The protocols for the page. Letters do not depend on them, so a file that cannot be read does not end the gateway.
+fn library(config: &Config) -> Library {
+    if config.http.listen.is_empty() {
+        return Library::standard();
+    }
+    checker::protocols(&config.monitor.protocols, None).unwrap_or_else(|failure| {
+        report::warn(&format!(
+            "the dashboard checks the protocols of the standards only: {}",
+            failure.problem()
+        ));
+        Library::standard()
+    })
 }

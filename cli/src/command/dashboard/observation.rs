@@ -14,7 +14,7 @@ use tokio::time::{Instant, MissedTickBehavior};
 
 use super::goals::{Cancelled, Robots};
 use super::offers::{self, Offers};
-use super::orders::Orders;
+use super::orders::{OrderError, Orders};
 use super::picture::{Picture, Wanted};
 use super::view::View;
 use crate::command::top::{self, Observer};
@@ -92,15 +92,20 @@ impl Observation {
         last.is_some_and(|last| last.elapsed() <= 2 * LOCKS_INTERVAL)
     }
 
-    /// Shows a goal that a client of the page has cancelled.
-    pub(super) fn show_cancelled(&self, cancelled: &Cancelled) {
-        self.picture.lock().goals.add_cancelled(cancelled);
+    /// Cancels a goal for a client of the page, and shows it.
+    pub(super) async fn cancel(&self, order: &[u8]) -> Result<Cancelled, OrderError> {
+        self.orders.cancel(order, &self.picture).await
     }
 
     /// Keeps the domain observed.
     pub(super) fn keep(&self) {
         *self.last.lock() = Instant::now();
         self.wanted.notify_one();
+    }
+
+    /// Whether a page has shown the domain lately.
+    fn is_kept(&self) -> bool {
+        self.last.lock().elapsed() < KEPT
     }
 }
 
@@ -111,6 +116,10 @@ pub(super) async fn run(observation: Arc<Observation>, library: Arc<Library>, co
         is_stopped = tokio::select! {
             () = observation.stopped.notified() => true,
             () = observation.wanted.notified() => {
+                // The last observation has left a wake-up behind.
+                if !observation.is_kept() {
+                    continue;
+                }
                 let observed = observe(&observation, &library, &config).await;
                 match observed {
                     Ok(is_stopped) => {
@@ -118,7 +127,9 @@ pub(super) async fn run(observation: Arc<Observation>, library: Arc<Library>, co
                         is_stopped
                     }
                     Err(failure) => {
-                        observation.picture.lock().fail(failure.problem());
+                        let mut picture = Picture::new(observation.orders.are_permitted());
+                        picture.fail(failure.problem());
+                        *observation.picture.lock() = picture;
                         let stopped = observation.stopped.notified();
                         tokio::time::timeout(RETRY, stopped).await.is_ok()
                     }
@@ -179,7 +190,7 @@ async fn follow(
                     let counted = observer.snapshot(&watcher);
                     let entries = watcher.directory().entries();
                     observation.picture.lock().look(SystemTime::now(), &entries, counted);
-                    if observation.last.lock().elapsed() >= KEPT {
+                    if !observation.is_kept() {
                         return;
                     }
                 }
@@ -192,10 +203,7 @@ async fn follow(
         () = ask_for_locks(observation, &locks_asker, locks_sender) => false,
         () = offers::serve(&observation.offers, &locks_asker) => false,
         () = ask_for_goals(observation, &robots, &locks_asker) => false,
-        served = observation.orders.serve(domain, config) => {
-            served?;
-            false
-        }
+        () = observation.orders.serve(domain, config) => false,
         () = observation.stopped.notified() => true,
     };
     Ok(is_stopped)

@@ -2,25 +2,30 @@
 //! access of the receivers apply to it as to every agent.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use fipa::actions::{ActionError, GoalRef};
 use fipa::error::ErrorChain;
-use fipa::{Agent, AgentId, Config, Domain, Performative, RegisterOptions};
+use fipa::{Agent, AgentId, Config, Domain, Performative, RegisterOptions, log_limit};
+use fipa_acl::{escape, escape_name};
+use parking_lot::Mutex;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
 use super::goals::Cancelled;
-use super::picture::clipped;
+use super::picture::{Picture, clipped};
 use crate::membership;
-use crate::report::Failure;
 
-/// Maximum wait for the outcome of a message.
+/// Maximum wait for the registration of the agent, and for the outcome of a message.
 const WITHIN: Duration = Duration::from_secs(10);
 
-/// Maximum wait for the end of a goal. Shorter than the time of a connection, so that the client gets an answer.
+/// Maximum wait for the end of a goal.
 const STOP: Duration = Duration::from_secs(8);
+
+/// Time before the next attempt to register the agent.
+const RETRY: Duration = Duration::from_secs(5);
 
 /// A message to send.
 #[derive(Debug, Deserialize)]
@@ -79,6 +84,8 @@ pub(super) enum OrderError {
 pub(super) struct Orders {
     is_permitted: bool,
     agent: watch::Sender<Option<Arc<Agent>>>,
+    /// Number of the next cancel.
+    next: AtomicU64,
 }
 
 impl Orders {
@@ -86,6 +93,7 @@ impl Orders {
         Self {
             is_permitted: config.http.control,
             agent: watch::Sender::default(),
+            next: AtomicU64::default(),
         }
     }
 
@@ -95,8 +103,8 @@ impl Orders {
     }
 
     /// Registers the agent, and reads its letters until the future is dropped: the page shows them as all others. Never
-    /// ends if clients may only see.
-    pub(super) async fn serve(&self, domain: &Domain, config: &Config) -> Result<(), Failure> {
+    /// ends if clients may only see. While another agent has the name, the page shows the domain all the same.
+    pub(super) async fn serve(&self, domain: &Domain, config: &Config) {
         if !self.is_permitted {
             return std::future::pending().await;
         }
@@ -105,11 +113,20 @@ impl Orders {
             agent_type: "fipa-dashboard".to_owned(),
             description: "sends messages of the web page of this gateway".to_owned(),
         };
-        let agent = Arc::new(membership::register(domain, &name, options, config).await?);
+        let agent = loop {
+            match membership::register(domain, &name, options.clone(), config).await {
+                Ok(agent) => break Arc::new(agent),
+                Err(failure) => {
+                    let (name, problem) = (escape_name(&name), failure.problem());
+                    let problem = escape(&problem);
+                    log_limit::warn!("the dashboard has no agent {name}; trying again: {problem}");
+                }
+            }
+            tokio::time::sleep(RETRY).await;
+        };
         let _left = Left(&self.agent);
         self.agent.send_replace(Some(Arc::clone(&agent)));
         while agent.receive().await.is_ok() {}
-        Ok(())
     }
 
     /// Sends a message, and returns its outcomes in the JSON of `fipa send`. Waits for the registration of the agent.
@@ -152,25 +169,44 @@ impl Orders {
         Ok(json!({ "deliveries": deliveries }))
     }
 
-    /// Cancels a goal, and waits until it has ended. Waits for the registration of the agent.
+    /// Cancels a goal, and waits until it has ended. Waits for the registration of the agent. The picture shows the
+    /// cancel from its begin: it may take effect although its client has left.
     ///
     /// # Errors
     /// If clients may only see, the order is not valid, or the robot does not cancel the goal.
-    pub(super) async fn cancel(&self, order: &[u8]) -> Result<Cancelled, OrderError> {
+    pub(super) async fn cancel(
+        &self,
+        order: &[u8],
+        picture: &Mutex<Picture>,
+    ) -> Result<Cancelled, OrderError> {
         if !self.is_permitted {
             return Err(OrderError::NoControl);
         }
         let order: CancelOrder = serde_json::from_slice(order)?;
         let agent = self.registered().await?;
         let robot = agent.robot(AgentId::new(&*order.robot)?);
-        let cancelled = robot.cancel(GoalRef::from(order.goal).of(order.client));
-        let cancelled = tokio::time::timeout(STOP, cancelled).await;
-        Ok(Cancelled {
-            status: cancelled.map_err(|_| OrderError::GoesOn)??,
+        let mut cancelled = Cancelled {
+            number: self.next.fetch_add(1, Ordering::Relaxed),
             at: SystemTime::now(),
             by: agent.name().to_owned(),
             robot: order.robot,
-        })
+            goal: order.goal.clone(),
+            client: order.client.clone(),
+            outcome: None,
+        };
+        picture.lock().goals.put_cancelled(&cancelled);
+        let ended = robot.cancel(GoalRef::from(order.goal).of(order.client));
+        let ended = match tokio::time::timeout(STOP, ended).await {
+            Ok(ended) => ended.map_err(OrderError::from),
+            Err(_) => Err(OrderError::GoesOn),
+        };
+        let (outcome, error) = match ended {
+            Ok(status) => (Ok(status), None),
+            Err(error) => (Err(error.to_string()), Some(error)),
+        };
+        cancelled.outcome = Some(outcome);
+        picture.lock().goals.put_cancelled(&cancelled);
+        error.map_or(Ok(cancelled), Err)
     }
 
     /// The agent of the page, if it is registered.

@@ -36,6 +36,9 @@ const MAX_ORDER: usize = 64 << 10;
 /// Minimum time between two changes that a page gets.
 const PACE: Duration = Duration::from_millis(200);
 
+/// Time after which a stream ends, so that the browser begins another one, with a session that is still valid.
+const MAX_STREAM: Duration = Duration::from_secs(600);
+
 /// Time without a change after which a page gets a sign of life.
 const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
 
@@ -97,6 +100,17 @@ struct Shown {
     observation: Arc<Observation>,
     library: Arc<Library>,
     places: Arc<Semaphore>,
+}
+
+impl Shown {
+    /// Keeps the domain observed and, if clients may give orders, the connection open: an order may take longer than
+    /// others have. Its waits are bounded.
+    fn wait_for_order(&self, connection: &KeepOpen) {
+        self.observation.keep();
+        if self.observation.orders.are_permitted() {
+            connection.keep();
+        }
+    }
 }
 
 /// Returns the pages that show what is observed.
@@ -211,19 +225,24 @@ async fn image(
 }
 
 /// Sends a message, and answers with its outcomes.
-async fn send(State(shown): State<Shown>, order: Bytes) -> Response {
-    shown.observation.keep();
+async fn send(
+    State(shown): State<Shown>,
+    Extension(connection): Extension<KeepOpen>,
+    order: Bytes,
+) -> Response {
+    shown.wait_for_order(&connection);
     answer_to_order(shown.observation.orders.send(&order).await)
 }
 
 /// Cancels a goal, and answers with its end.
-async fn cancel(State(shown): State<Shown>, order: Bytes) -> Response {
-    shown.observation.keep();
-    let cancelled = shown.observation.orders.cancel(&order).await;
-    answer_to_order(cancelled.map(|cancelled| {
-        shown.observation.show_cancelled(&cancelled);
-        cancelled_object(&cancelled)
-    }))
+async fn cancel(
+    State(shown): State<Shown>,
+    Extension(connection): Extension<KeepOpen>,
+    order: Bytes,
+) -> Response {
+    shown.wait_for_order(&connection);
+    let cancelled = shown.observation.cancel(&order).await;
+    answer_to_order(cancelled.map(|cancelled| cancelled_object(&cancelled)))
 }
 
 fn answer_to_order(executed: Result<Value, OrderError>) -> Response {
@@ -252,6 +271,7 @@ struct Following {
     wanted: Wanted,
     /// The state that the page has.
     sent: Option<Arc<View>>,
+    began: Instant,
     at: Instant,
     pace: Interval,
     _place: OwnedSemaphorePermit,
@@ -279,11 +299,15 @@ async fn live(
         observation: shown.observation,
         wanted,
         sent: None,
+        began: Instant::now(),
         at: Instant::now(),
         pace,
         _place: place,
     };
     let events = stream::unfold(following, |mut following| async {
+        if following.began.elapsed() >= MAX_STREAM {
+            return None;
+        }
         let event = following.next().await;
         Some((Ok::<_, Infallible>(event), following))
     });

@@ -58,6 +58,9 @@ impl View {
                 push_key(&mut set, section);
                 push_rows(&mut set, changed);
             }
+        }
+        for (section, before) in &earlier.sections {
+            let rows = self.sections.get(section).unwrap_or(&none);
             let removed = before.keys().filter(|key| !rows.contains_key(*key));
             let removed: Vec<&String> = removed.collect();
             if !removed.is_empty() {
@@ -104,10 +107,12 @@ mod tests {
 
     use super::*;
 
-    fn view(rows: &[(bool, String, u8)]) -> View {
+    fn view(has_sections: bool, rows: &[(bool, String, u8)]) -> View {
         let mut view = View::default();
-        view.section("a");
-        view.section("b");
+        if has_sections {
+            view.section("a");
+            view.section("b");
+        }
         for (first, key, row) in rows {
             let section = if *first { "a" } else { "b" };
             view.put(section, key.as_str(), &json!({ "n": row }));
@@ -118,10 +123,8 @@ mod tests {
     /// Applies changes as the page does.
     fn apply(state: &mut Map<String, Value>, changes: &Value) {
         for (section, rows) in changes["set"].as_object().unwrap() {
-            let into = state
-                .get_mut(section)
-                .and_then(Value::as_object_mut)
-                .unwrap();
+            let into = state.entry(section.as_str()).or_insert_with(|| json!({}));
+            let into = into.as_object_mut().unwrap();
             into.extend(rows.as_object().unwrap().clone());
         }
         for (section, keys) in changes["gone"].as_object().unwrap() {
@@ -137,7 +140,7 @@ mod tests {
 
     #[test]
     fn equal_views_have_no_changes() {
-        let one = view(&[(true, "x".to_owned(), 1)]);
+        let one = view(true, &[(true, "x".to_owned(), 1)]);
         assert_eq!(one.changes_since(&one.clone()), None);
         assert_eq!(one.json(), r#"{"a":{"x":{"n":1}},"b":{}}"#);
     }
@@ -145,15 +148,20 @@ mod tests {
     proptest! {
         #[test]
         fn a_state_with_its_changes_is_the_next_state(
+            have_sections in any::<(bool, bool)>(),
             before in prop::collection::vec((any::<bool>(), ".{0,3}", 0_u8..3), 0..8),
             after in prop::collection::vec((any::<bool>(), ".{0,3}", 0_u8..3), 0..8),
         ) {
-            let (before, after) = (view(&before), view(&after));
+            let (before, after) = (view(have_sections.0, &before), view(have_sections.1, &after));
             let mut state: Map<String, Value> = serde_json::from_str(&before.json()).unwrap();
             if let Some(changes) = after.changes_since(&before) {
                 apply(&mut state, &serde_json::from_str(&changes).unwrap());
             }
-            let expected: Map<String, Value> = serde_json::from_str(&after.json()).unwrap();
+            let mut expected: Map<String, Value> = serde_json::from_str(&after.json()).unwrap();
+            // A section without rows is as one that is missing.
+            for view in [&mut state, &mut expected] {
+                view.retain(|_, rows| *rows != json!({}));
+            }
             prop_assert_eq!(state, expected);
         }
     }

@@ -168,11 +168,10 @@ async fn gateway(part: &Part) -> Result<(), Failed> {
     if config.http.listen.is_empty() {
         return fipa_reconfiguration::run(part).await;
     }
-    let failed = |failure: Failure| failure.problem();
-    let (dashboard, pages) = Dashboard::start(&config).map_err(failed)?;
+    let (dashboard, pages) = Dashboard::start(&config);
     let gateway = Gateway::open_with_pages(&config, pages).await?;
     if let Some(listener) = gateway.http() {
-        let link = dashboard::link(&listener).map_err(failed)?;
+        let link = dashboard::link(&listener).map_err(|failure| failure.problem())?;
         Reporter::new(&part.name).claim(Claim::Page { link });
     }
     fipa_reconfiguration::serve_gateway(part, gateway).await;

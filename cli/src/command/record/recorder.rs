@@ -22,8 +22,9 @@ use super::note::Note;
 use crate::command::watch::checker::{CheckResult, Checker, Earlier, Letter};
 use crate::command::watch::filter::Filter;
 use crate::command::watch::{OBSERVATION_DELAY, json};
+use crate::input;
+use crate::output::moment;
 use crate::report::{self, Failure};
-use crate::{input, output};
 
 /// An observation for the thread that writes.
 pub(super) enum Observation {
@@ -346,7 +347,7 @@ impl Recorder {
             let seconds = (abandoned.waited.as_secs_f64() * 1e3).round() / 1e3;
             event.insert("seconds".to_owned(), seconds.into());
             event.insert("holder".to_owned(), abandoned.holder.as_deref().into());
-            let since = abandoned.held_since.map(rfc3339);
+            let since = abandoned.held_since.map(moment);
             event.insert("held_since".to_owned(), since.into());
             event.insert("fence".to_owned(), abandoned.fence.as_deref().into());
         }
@@ -382,7 +383,7 @@ impl Recorder {
     fn directory(&mut self, directory: Directory) -> Result<(), Failure> {
         let now = SystemTime::now();
         for gone in self.hosts.handle(&directory.left, &directory.appeared) {
-            let last = gone.last_letter.map(rfc3339);
+            let last = gone.last_letter.map(moment);
             let event = json!({
                 "event": "host_gone", "host": *gone.host, "agents": gone.agents, "last_letter": last,
             });
@@ -583,7 +584,7 @@ fn begin(
 ) -> Result<RecordingFile, RecordingError> {
     let mut file = RecordingFile::create(path)?;
     let mut about = about.clone();
-    about.insert("began".to_owned(), rfc3339(SystemTime::now()));
+    about.insert("began".to_owned(), moment(SystemTime::now()));
     file.write_metadata(file::ABOUT, about)?;
     if !is_whole {
         file.write_metadata(file::FILTERED, BTreeMap::new())?;
@@ -605,13 +606,9 @@ fn finish(mut file: RecordingFile, totals: &Totals) -> Result<u64, RecordingErro
         .into_iter()
         .map(|(key, number)| (key.to_owned(), number.to_string()))
         .collect();
-    metadata.insert("ended".to_owned(), rfc3339(SystemTime::now()));
+    metadata.insert("ended".to_owned(), moment(SystemTime::now()));
     file.write_metadata(file::TOTALS, metadata)?;
     file.finish()
-}
-
-pub(super) fn rfc3339(time: SystemTime) -> String {
-    output::rfc3339(time).unwrap_or_default()
 }
 
 fn nanos(time: SystemTime) -> u64 {

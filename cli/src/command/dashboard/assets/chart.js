@@ -51,5 +51,11 @@ export function chart() {
         + `at most ${Math.max(...data[1]).toFixed(1)}; not delivered: at most ${Math.max(...data[2]).toFixed(1)}`;
       if (words.textContent !== text) words.textContent = text;
     },
+    /** Frees what the chart holds beside its nodes. */
+    close() {
+      resized.disconnect();
+      plot?.destroy();
+      plot = null;
+    },
   };
 }

@@ -1,6 +1,6 @@
 // All conversations, and one as a sequence diagram.
 
-import { clock, drawing, element, link, problems, table } from './elements.js';
+import { clock, drawing, element, facts, link, problems, table } from './elements.js';
 import { letterTable } from './letters.js';
 
 const COLUMNS = [
@@ -109,12 +109,11 @@ export function conversation(id) {
   const update = (sections) => {
     const row = sections.conversation?.[id];
     const all = Object.values(sections.letters ?? {}).sort((a, b) => a.number - b.number);
-    const facts = row
+    const known = row
       ? [['Protocol', row.protocol ?? '–'], ['State', row.complete ? `${row.state} (complete)` : row.state ?? '–'],
         ['Letters', row.letters], ['Violations', row.violations, row.violations > 0]]
       : [['State', 'unknown: it began before this page observed the domain, or is forgotten', true]];
-    about.replaceChildren(...facts.map(([title, value, isBad]) => element('div', {},
-      element('dt', {}, title), element('dd', { class: isBad ? 'bad-text' : null }, String(value)))));
+    about.replaceChildren(...facts(known));
     const violations = all.filter((letter) => letter.violation);
     found.replaceChildren(...violations.map((letter) => element('p', { class: 'bad-text' },
       `${clock(letter.time)}: ${letter.violation}`)));

@@ -30,6 +30,12 @@ export function link(view, name, text = name) {
   return element('a', { href: `#/${view}/${encodeURIComponent(name)}` }, text);
 }
 
+/** The parts of a list of facts: of each the title, the value, and whether it is bad. */
+export function facts(list) {
+  return list.map(([title, value, isBad = false]) => element('div', {},
+    element('dt', {}, title), element('dd', { class: isBad ? 'bad-text' : null }, value)));
+}
+
 /** Time for rows in one frame, in milliseconds. Further rows follow in the next frames, so that the page answers. */
 const SLICE = 8;
 /** The tables with rows to draw. */
@@ -148,7 +154,7 @@ export function longTable(caption, columns, draw) {
 /** The violations and failures of an agent or a conversation. */
 export function problems({ violations, failures }) {
   const found = [];
-  if (violations) found.push(`${violations} ${violations === 1 ? 'violation' : 'violations'}`);
+  if (violations) found.push(count(violations, 'violation'));
   if (failures) found.push(`${failures} not delivered`);
   return found.join(', ');
 }

@@ -1,10 +1,11 @@
 // Hosts with their agents, and one agent.
 
-import { clock, count, element, link, longTable, problems, rate, seconds, span, table } from './elements.js';
+import { clock, count, element, facts, link, longTable, problems, rate, seconds, span, table } from './elements.js';
 import { chart } from './chart.js';
 import { coalitions, members } from './coalitions.js';
 import { conversationTable } from './conversations.js';
 import { letterTable } from './letters.js';
+import { post } from './live.js';
 import { offers } from './offers.js';
 
 /** Median time of letters to another host from which a link counts as slow, in microseconds. */
@@ -80,17 +81,15 @@ function totals(values) {
     ['Not delivered', values.failures, 'letters'],
     ['Violations', values.violations, 'conversations'],
   ];
-  return shown.map(([name, value, view]) => {
-    const text = view && value > 0 ? element('a', { href: `#/${view}`, class: 'bad-text' }, String(value)) : String(value);
-    return element('div', {}, element('dt', {}, name), element('dd', {}, text));
-  });
+  return facts(shown.map(([name, value, view]) =>
+    [name, view && value > 0 ? element('a', { href: `#/${view}`, class: 'bad-text' }, value) : value]));
 }
 
 /** Hosts that are lost or slow, and agents that have ended, except commands of fipa. */
 function alerts(hosts, agents) {
   const all = [];
   for (const [name, host] of Object.entries(hosts)) {
-    if (host.state !== 'connected') all.push([`${name} `, host.state === 'lost' ? `is lost since ${seconds(host.seconds)}` : 'does not answer']);
+    if (host.state !== 'connected') all.push([`${name} `, host.state === 'lost' ? `has been lost for ${seconds(host.seconds)}` : 'does not answer']);
     else if (host.median_us >= SLOW) all.push([`Letters to ${name} are slow: they take ${span(host.median_us)}`]);
   }
   const ended = Object.values(agents).filter((row) => row.ended && !row.type?.startsWith('fipa-'));
@@ -98,7 +97,7 @@ function alerts(hosts, agents) {
   for (const row of ended.slice(0, MAX_ENDED)) {
     all.push([link('agent', row.name), ` on ${row.here ? 'this host' : row.host ?? 'another host'} ended ${clock(row.ended)}`]);
   }
-  if (ended.length > MAX_ENDED) all.push([`${ended.length - MAX_ENDED} more agents ended`]);
+  if (ended.length > MAX_ENDED) all.push([`${count(ended.length - MAX_ENDED, 'further agent')} ended`]);
   return all.map((parts) => element('li', {}, ...parts));
 }
 
@@ -109,7 +108,8 @@ export function fleet() {
   const hosts = element('div', { class: 'hosts' });
   const groups = coalitions();
   const cards = new Map();
-  const update = ({ domain, hosts: peers = {}, agents = {}, history = {} }) => {
+  const none = Object.create(null);
+  const update = ({ domain, hosts: peers = none, agents = none, history = none }) => {
     const values = domain?.totals;
     if (values?.host === undefined) return;
     document.getElementById('title').textContent = `${values.domain} on ${values.host}`;
@@ -145,7 +145,7 @@ export function fleet() {
       }
     }
   };
-  return { node: element('div', {}, numbers, problemList, rates.node, groups.node, hosts), path: 'fleet', update };
+  return { node: element('div', {}, numbers, problemList, rates.node, groups.node, hosts), path: 'fleet', update, close: rates.close };
 }
 
 const PERFORMATIVES = ['request', 'inform', 'query-ref', 'query-if', 'cancel', 'subscribe', 'cfp', 'accept-proposal',
@@ -165,9 +165,7 @@ function messageForm(to) {
     result.textContent = 'sending';
     const order = { to, performative: performative.value };
     for (const { name, value } of [protocol, conversation, content]) if (value) order[name] = value;
-    const answer = await fetch('api/send', {
-      method: 'POST', headers: { 'X-Fipa': '1', 'Content-Type': 'application/json' }, body: JSON.stringify(order),
-    }).catch((error) => ({ ok: false, text: () => error.message }));
+    const answer = await post('api/send', order);
     if (!answer.ok) result.textContent = (await answer.text()).trim();
     else {
       const { deliveries } = await answer.json();
@@ -212,12 +210,11 @@ export function agent(name, topic) {
   const update = (sections) => {
     const row = sections.agent?.[name];
     form.hidden = !sections.domain?.totals?.control;
-    const facts = row
+    const known = row
       ? [['Host', row.host ?? 'this host'], ['Type', row.type || '–'], ['Since', clock(row.registered)],
         ['State', row.ended ? `ended ${clock(row.ended)}` : 'in the directory', Boolean(row.ended)]]
       : [['State', 'not in the directory', true]];
-    about.replaceChildren(...facts.map(([title, value, isBad]) => element('div', {},
-      element('dt', {}, title), element('dd', { class: isBad ? 'bad-text' : null }, value))));
+    about.replaceChildren(...facts(known));
     group.show(row);
     offer.update(sections);
     partners.rows.show(Object.entries(sections.partners ?? {}));

@@ -1,6 +1,7 @@
 // The goals that agents run, and their cancel.
 
 import { clock, element, link, table } from './elements.js';
+import { post } from './live.js';
 
 const COLUMNS = [
   { title: 'Action' }, { title: 'Robot' }, { title: 'Progress' }, { title: 'Since', class: 'optional' }, { title: '' },
@@ -22,12 +23,12 @@ function progress(row) {
 function cancelledRow(row) {
   return element('tr', {},
     element('td', { class: 'short' }, clock(row.time)),
-    element('td', { class: 'act' }, row.action, element('div', { class: 'faint' }, 'of ', link('agent', row.robot)),
+    element('td', { class: 'act' }, row.action ?? row.goal, element('div', { class: 'faint' }, 'of ', link('agent', row.robot)),
       element('div', { class: 'faint' }, 'for ', link('agent', row.client))),
     element('td', { class: 'name' }, link('agent', row.by)), element('td', {}, row.reason ?? row.state));
 }
 
-/** Tables of goals: those that run, and those that this page has cancelled. */
+/** Tables of goals: those that run, and those that pages cancel. */
 export function goalTables() {
   const pending = new Set();
   const result = element('p', { role: 'status' });
@@ -36,10 +37,7 @@ export function goalTables() {
     button.disabled = true;
     result.textContent = `cancelling ${row.action} of ${row.robot}`;
     const { robot, goal, client } = row;
-    const answer = await fetch('api/cancel', {
-      method: 'POST', headers: { 'X-Fipa': '1', 'Content-Type': 'application/json' },
-      body: JSON.stringify({ robot, goal, client }),
-    }).catch((error) => ({ ok: false, text: () => error.message }));
+    const answer = await post('api/cancel', { robot, goal, client });
     // The row of a goal that has ended disappears. A row that has changed has another button.
     if (!answer.ok) {
       pending.delete(key);
@@ -65,7 +63,7 @@ export function goalTables() {
       element('td', { class: 'act' }, act));
   };
   const running = table('Running goals, asked every second', COLUMNS, goalRow);
-  const cancelled = table('Cancelled from a page of this gateway, the newest first', CANCELLED_COLUMNS, cancelledRow);
+  const cancelled = table('Cancels from pages of this gateway, the newest first', CANCELLED_COLUMNS, cancelledRow);
   const none = element('p', { class: 'faint' }, 'no agent runs an action');
   const cancelledBox = element('div', { class: 'card', hidden: true }, cancelled.node);
   const update = (sections) => {

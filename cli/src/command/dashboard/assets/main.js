@@ -15,6 +15,8 @@ const PLACES = { agent: 'fleet', conversation: 'conversations' };
 const content = document.getElementById('content');
 const state = document.getElementById('state');
 let live = null;
+/** Frees what the shown view holds beside its nodes; null if that is nothing. */
+let closeView = null;
 
 /** Exchanges the token for a session, which no script can read. */
 async function begin(token) {
@@ -27,9 +29,16 @@ function say(text, isBad = false) {
   state.classList.toggle('bad', isBad);
 }
 
-function askForToken(problem = '') {
+/** Ends the shown view. */
+function leave() {
   live?.close();
   live = null;
+  closeView?.();
+  closeView = null;
+}
+
+function askForToken(problem = '') {
+  leave();
   say('not signed in', true);
   const input = element('input', { type: 'password', name: 'token', autocomplete: 'off', required: true });
   const submit = async (event) => {
@@ -51,7 +60,7 @@ function askForToken(problem = '') {
 /** Shows the view of the address. */
 function show() {
   const [, view = 'fleet', parameter, choice] = location.hash.split('/');
-  const make = VIEWS[view];
+  const make = Object.hasOwn(VIEWS, view) ? VIEWS[view] : null;
   if (!make) {
     location.replace('#/fleet');
     return;
@@ -62,8 +71,9 @@ function show() {
     else item.removeAttribute('aria-current');
   }
   const name = parameter === undefined ? '' : decodeURIComponent(parameter);
-  const { node, path, update } = make(name, choice === undefined ? null : decodeURIComponent(choice));
-  live?.close();
+  const { node, path, update, close = null } = make(name, choice === undefined ? null : decodeURIComponent(choice));
+  leave();
+  closeView = close;
   content.replaceChildren(node);
   document.title = name ? `${name} · fipa` : `fipa · ${view}`;
   say('connecting');

@@ -1,6 +1,6 @@
 // The last minutes again: the domain at a time that a slider chooses.
 
-import { clock, element, link, problems, rate, span, table } from './elements.js';
+import { clock, element, facts, link, problems, rate, span, table } from './elements.js';
 import { chart } from './chart.js';
 import { letterTable } from './letters.js';
 
@@ -97,8 +97,7 @@ function conversationsOf(letters) {
 function totals(point, at, agents, hosts) {
   const shown = [['Time', clock(at * 1000)], ['Agents', agents], ['Hosts', hosts], ['Letters/s', rate(point?.letters_per_second) || '–'], ['Not delivered/s', rate(point?.failures_per_second) || '–',
       point?.failures_per_second > 0], ['Delivery', span(point?.median_us) || '–']];
-  return shown.map(([name, value, isBad]) => element('div', {},
-    element('dt', {}, name), element('dd', { class: isBad ? 'bad-text' : null }, String(value))));
+  return facts(shown);
 }
 
 export function past(start) {
@@ -204,5 +203,5 @@ export function past(start) {
     latest = sections;
     draw();
   };
-  return { node, path: 'fleet', update };
+  return { node, path: 'fleet', update, close: rates.close };
 }

@@ -9,7 +9,7 @@ use fipa::platform::{AgentDescription, PlatformError};
 use fipa::protocol::{DialogueError, Keep};
 use fipa::{Agent, AgentId, Performative};
 use tokio::task::JoinSet;
-use tokio::time::MissedTickBehavior;
+use tokio::time::{Instant, MissedTickBehavior};
 
 use super::value::TopicValue;
 use super::{Answers, Offers};
@@ -26,8 +26,11 @@ const WITHIN: Duration = Duration::from_secs(5);
 /// Time between two values of a topic with more of them.
 const PACE: Duration = Duration::from_millis(500);
 
-/// Time before the next attempt to subscribe.
+/// Time before the next attempt to subscribe, and between two values that are too large.
 const RETRY: Duration = Duration::from_secs(5);
+
+/// The problem of a topic with values that pages do not show.
+const TOO_LARGE: &str = "its values are larger than 1 MiB";
 
 /// The type of the services that list topics.
 const TOPIC: &str = "topic";
@@ -160,7 +163,7 @@ impl Follower {
     async fn follow(&self, topic: &str) {
         loop {
             let pause = match self.values(topic).await {
-                Ok(()) => PACE,
+                Ok(pause) => pause,
                 Err(error) => {
                     let problem = ErrorChain(&error).to_string();
                     self.offers.fail(&self.name, topic, &problem);
@@ -172,12 +175,12 @@ impl Follower {
     }
 
     /// Subscribes, and takes values for as long as they do not come faster than pages show them: a page does not make
-    /// a network carry each image of a camera.
-    async fn values(&self, topic: &str) -> Result<(), DialogueError> {
+    /// a network carry each image of a camera. The rate and the length that the publisher states may be wrong. Returns
+    /// the time before the next subscription.
+    async fn values(&self, topic: &str) -> Result<Duration, DialogueError> {
         if self.offers.is_too_large(&self.name, topic) {
-            self.offers
-                .fail(&self.name, topic, "its values are larger than 1 MiB");
-            return Ok(());
+            self.offers.fail(&self.name, topic, TOO_LARGE);
+            return Ok(PACE);
         }
         let subscribe = self.agent.message(Performative::Subscribe);
         let subscribe = subscribe
@@ -187,6 +190,9 @@ impl Follower {
             .agent
             .subscribe_keeping(Keep::latest(1), subscribe, WITHIN);
         let mut subscription = subscribed.await?;
+        // The first value may be an old one.
+        let mut is_first = true;
+        let mut last: Option<Instant> = None;
         loop {
             let notification = match subscription.next().await {
                 Ok(notification) => notification,
@@ -196,8 +202,18 @@ impl Follower {
             let value = TopicValue::of(&notification);
             // Its memory is the publisher's.
             drop(notification);
-            if self.offers.take_value(&self.name, topic, value) {
-                return subscription.cancel(WITHIN).await;
+            let is_too_large = value.is_too_large();
+            let mut is_fast = self.offers.take_value(&self.name, topic, value);
+            if !std::mem::take(&mut is_first) {
+                let last = last.replace(Instant::now());
+                is_fast |= last.is_some_and(|last| last.elapsed() < PACE);
+            }
+            if is_too_large {
+                self.offers.fail(&self.name, topic, TOO_LARGE);
+            }
+            if is_too_large || is_fast {
+                subscription.cancel(WITHIN).await?;
+                return Ok(if is_too_large { RETRY } else { PACE });
             }
         }
     }

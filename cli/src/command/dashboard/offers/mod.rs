@@ -138,7 +138,7 @@ impl Offers {
         agent.map_or_else(Vec::new, |agent| agent.take(answers, Instant::now()))
     }
 
-    /// Takes a value of a topic. Returns whether further ones come faster than pages show them.
+    /// Takes a value of a topic. Returns whether the publisher states that they come faster than pages show them.
     fn take_value(&self, name: &str, topic: &str, value: TopicValue) -> bool {
         self.change(name, topic, |topic| {
             topic.number += 1;

@@ -65,6 +65,11 @@ impl TopicValue {
         }
     }
 
+    /// Whether it is too large to be shown.
+    pub(super) fn is_too_large(&self) -> bool {
+        is_too_large(self.len as u64)
+    }
+
     /// The image, with its media type.
     pub(super) fn image(&self) -> Option<(&'static str, Bytes)> {
         match &self.shown {

@@ -1,4 +1,4 @@
-//! The goals that agents run, and those that a client of the page has cancelled.
+//! The goals that agents run, and those that a client of the page cancels.
 
 use std::collections::VecDeque;
 
@@ -20,7 +20,6 @@ pub(in crate::command::dashboard) struct Goals {
     running: Vec<(String, Value)>,
     /// The newest last, each with its number.
     cancelled: VecDeque<(u64, Value)>,
-    next: u64,
 }
 
 impl Goals {
@@ -29,14 +28,18 @@ impl Goals {
         self.running = running.iter().take(MAX_GOALS).map(row).collect();
     }
 
-    /// Takes a goal that a client of the page has cancelled.
-    pub(in crate::command::dashboard) fn add_cancelled(&mut self, cancelled: &Cancelled) {
+    /// Takes a goal that a client of the page cancels, or its outcome.
+    pub(in crate::command::dashboard) fn put_cancelled(&mut self, cancelled: &Cancelled) {
+        let row = cancelled_object(cancelled);
+        let mut known = self.cancelled.iter_mut();
+        if let Some((_, known)) = known.find(|(number, _)| *number == cancelled.number) {
+            *known = row;
+            return;
+        }
         if self.cancelled.len() >= MAX_CANCELLED {
             self.cancelled.pop_front();
         }
-        self.cancelled
-            .push_back((self.next, cancelled_object(cancelled)));
-        self.next += 1;
+        self.cancelled.push_back((cancelled.number, row));
     }
 
     /// Adds the rows.
@@ -63,27 +66,80 @@ fn row(goal: &RunningGoal) -> (String, Value) {
         may_cancel,
     } = goal;
     let progress = status.progress.as_ref();
-    let key = format!("{robot} {} {}", status.client, status.goal);
+    let key = json!([robot, status.client, status.goal]).to_string();
+    // An order to cancel needs the whole names.
     let row = json!({
-        "robot": robot, "goal": clipped(&status.goal), "action": clipped(&status.action),
-        "client": clipped(&status.client), "state": status.state.as_str(), "since": moment(*since),
+        "robot": robot, "goal": status.goal, "action": clipped(&status.action), "client": status.client,
+        "state": status.state.as_str(), "since": moment(*since),
         "fraction": progress.and_then(|it| it.fraction), "note": progress.and_then(|it| it.note.as_deref()).map(clipped),
         "answered": is_answered, "may_cancel": may_cancel,
     });
-    (clipped(&key), row)
+    (key, row)
 }
 
-/// The object of a goal that a client of the page has cancelled.
+/// The object of a goal that a client of the page cancels.
 pub(in crate::command::dashboard) fn cancelled_object(cancelled: &Cancelled) -> Value {
     let Cancelled {
+        number: _,
         at,
         by,
         robot,
-        status,
+        goal,
+        client,
+        outcome,
     } = cancelled;
+    let (status, reason) = match outcome {
+        Some(Ok(status)) => {
+            let failure = status.failure.as_ref();
+            (Some(status), failure.map(ToString::to_string))
+        }
+        Some(Err(reason)) => (None, Some(reason.clone())),
+        None => (None, None),
+    };
     json!({
-        "time": moment(*at), "by": by, "robot": clipped(robot), "goal": clipped(&status.goal),
-        "action": clipped(&status.action), "client": clipped(&status.client), "state": status.state.as_str(),
-        "reason": status.failure.as_ref().map(|failure| clipped(&failure.to_string())),
+        "time": moment(*at), "by": by, "robot": clipped(robot), "goal": clipped(goal), "client": clipped(client),
+        "action": status.map(|status| clipped(&status.action)),
+        "state": status.map_or("asked", |status| status.state.as_str()),
+        "reason": reason.as_deref().map(clipped),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+
+    use std::time::UNIX_EPOCH;
+
+    use super::*;
+
+    fn cancelled(number: u64) -> Cancelled {
+        Cancelled {
+            number,
+            at: UNIX_EPOCH,
+            by: "dashboard@base".to_owned(),
+            robot: "crex".to_owned(),
+            goal: format!("g-{number}"),
+            client: "rover".to_owned(),
+            outcome: None,
+        }
+    }
+
+    #[test]
+    fn the_last_cancels_are_listed_from_their_begin_and_once() {
+        let mut goals = Goals::default();
+        for number in 0..=20 {
+            goals.put_cancelled(&cancelled(number));
+        }
+        let newest = |goals: &Goals| goals.cancelled.back().unwrap().1.clone();
+        assert_eq!(goals.cancelled.len(), MAX_CANCELLED);
+        assert_eq!(newest(&goals)["state"], "asked");
+        assert_eq!(newest(&goals)["reason"], Value::Null);
+        goals.put_cancelled(&Cancelled {
+            outcome: Some(Err("no answer".to_owned())),
+            ..cancelled(20)
+        });
+        assert_eq!(goals.cancelled.len(), MAX_CANCELLED);
+        assert_eq!(newest(&goals)["goal"], "g-20");
+        assert_eq!(newest(&goals)["reason"], "no answer");
+    }
 }

@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use fipa::Outcome;
 use fipa::admin::watch::{Fate, Passage};
+use fipa::{FailureReason, Outcome};
 use serde::Serialize;
 use serde_json::{Map, Value};
 
@@ -79,18 +79,17 @@ impl Letter {
         self.fate.clone_from(&passage.fate);
     }
 
-    /// The reason why it was not delivered.
-    pub(super) fn reason(&self) -> Option<String> {
+    /// The reason why it was not delivered, as its sender was told.
+    pub(super) fn reason(&self) -> Option<FailureReason> {
         match &self.fate {
-            Fate::Passed(Outcome::Failed { reason, .. })
-            | Fate::Settled(Outcome::Failed { reason, .. }) => Some(reason.to_string()),
+            Fate::Settled(Outcome::Failed { reason, .. }) => Some(*reason),
             _ => None,
         }
     }
 
     /// Whether its sender was told that it was not delivered.
     pub(super) fn has_failed(&self) -> bool {
-        matches!(&self.fate, Fate::Settled(Outcome::Failed { .. }))
+        self.reason().is_some()
     }
 
     /// The row of the letter.
@@ -138,6 +137,11 @@ impl Letters {
         {
             Arc::make_mut(letter).news(passage);
         }
+    }
+
+    /// The oldest letter.
+    pub(super) fn oldest(&self) -> Option<&Letter> {
+        self.newest.front().map(|letter| &**letter)
     }
 
     /// The letters, the newest first.

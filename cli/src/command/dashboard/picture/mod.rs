@@ -29,7 +29,7 @@ use super::view::View;
 use crate::command::locks;
 use crate::command::top::{Snapshot, TotalsObject, peer_object};
 use crate::command::watch::checker::CheckResult;
-use crate::output;
+pub(super) use crate::output::moment;
 
 /// Maximum length of a text, in characters.
 const MAX_TEXT: usize = 256;
@@ -249,8 +249,7 @@ impl Picture {
     fn past(&self, second: u64) -> View {
         let end = UNIX_EPOCH.checked_add(Duration::from_secs(second.saturating_add(1)));
         let mut view = self.newest_letters(|letter| end.is_none_or(|end| letter.at < end));
-        let since = self.letters.newest().last();
-        let since = since.map(|letter| moment(letter.at));
+        let since = self.letters.oldest().map(|letter| moment(letter.at));
         view.put("domain", "totals", &json!({ "since": since }));
         view
     }
@@ -272,9 +271,4 @@ pub(super) fn clipped(text: &str) -> String {
         Some((end, _)) => format!("{}…", text.get(..end).unwrap_or_default()),
         None => text.to_owned(),
     }
-}
-
-/// A time as RFC 3339; empty if it has no such form.
-pub(super) fn moment(time: SystemTime) -> String {
-    output::rfc3339(time).unwrap_or_default()
 }

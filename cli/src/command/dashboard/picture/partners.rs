@@ -1,19 +1,20 @@
 //! The partners of an agent, and the reasons why its letters were not delivered, among the newest letters.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
+use fipa::FailureReason;
 use serde_json::{Value, json};
 
 use super::letters::Letter;
 
-/// Maximum number of partners, and of reasons. Further ones are left out.
+/// Maximum number of partners. Further ones are left out.
 const MAX_ROWS: usize = 100;
 
 /// The letters of an agent with each partner, and the failures by their reasons.
 #[derive(Debug, Default)]
 pub(super) struct Partners {
     partners: BTreeMap<String, Counts>,
-    reasons: BTreeMap<String, u64>,
+    reasons: HashMap<FailureReason, u64>,
 }
 
 #[derive(Debug, Default)]
@@ -42,10 +43,7 @@ impl Partners {
                 counts.failures += u64::from(letter.has_failed());
                 counts.violations += u64::from(letter.violation.is_some());
             }
-            let reason = letter.reason().filter(|_| is_sent);
-            if let Some(reason) = reason
-                && (partners.reasons.len() < MAX_ROWS || partners.reasons.contains_key(&reason))
-            {
+            if let Some(reason) = letter.reason().filter(|_| is_sent) {
                 *partners.reasons.entry(reason).or_default() += 1;
             }
         }
@@ -64,13 +62,11 @@ impl Partners {
     }
 
     /// The rows of the reasons.
-    pub(super) fn reasons(&self) -> impl Iterator<Item = (&str, Value)> {
-        let rows = self.reasons.iter();
-        rows.map(|(reason, count)| {
-            (
-                reason.as_str(),
-                json!({ "reason": reason, "failures": count }),
-            )
+    pub(super) fn reasons(&self) -> impl Iterator<Item = (String, Value)> {
+        self.reasons.iter().map(|(reason, count)| {
+            let reason = reason.to_string();
+            let row = json!({ "reason": reason, "failures": count });
+            (reason, row)
         })
     }
 }

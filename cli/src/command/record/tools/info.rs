@@ -9,7 +9,6 @@ use fipa_acl::escape;
 use serde_json::{Value, json};
 
 use super::super::file::reader::Item;
-use super::super::recorder::rfc3339;
 use super::found::Found;
 use super::read_file;
 use crate::report::Failure;
@@ -247,5 +246,5 @@ fn quoted(path: &Path) -> String {
 }
 
 fn time(nanos: u64) -> String {
-    rfc3339(UNIX_EPOCH + Duration::from_nanos(nanos))
+    output::moment(UNIX_EPOCH + Duration::from_nanos(nanos))
 }

@@ -10,7 +10,6 @@ use serde_json::{Value, json};
 
 use super::super::file;
 use super::super::file::reader::Item;
-use super::super::recorder::rfc3339;
 use super::found::Found;
 use super::select::{Selection, Selector};
 use super::{read_file, read_quietly};
@@ -69,7 +68,7 @@ pub(in crate::command::record) fn run(arguments: &Arguments) -> Result<(), Failu
         }
         let at = UNIX_EPOCH + Duration::from_nanos(header.publish_time);
         let mut line = json!({
-            "topic": channel.topic, "time": rfc3339(at), "nanoseconds": header.publish_time,
+            "topic": channel.topic, "time": output::moment(at), "nanoseconds": header.publish_time,
         });
         // A merged file has the host of each channel.
         if let Some(host) = channel.metadata.get("host") {
