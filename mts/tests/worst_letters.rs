@@ -425,6 +425,13 @@ fn crowded(agents: u64) -> (Core, Arc<dyn Directory>, Instant) {
         }
     }
     assert!(lanes > LANES / 2, "{lanes} lanes");
+    // Letters of senders beyond the rate of new ones wait this long.
+    let most = (MOST_STEPS, "first letters");
+    timeouts(
+        &mut core,
+        most,
+        arrived_at.instant + Duration::from_millis(500),
+    );
     (core, directory, arrived_at.instant)
 }
 
