@@ -78,12 +78,7 @@ impl Shown {
 
     /// Opens the page in a browser.
     fn open(&self, name: &str, width: u32, height: u32) -> Option<Browser> {
-        let browser = Browser::open(name, width, height)?;
-        browser.go_to(&format!("http://{}/#token={}", self.address, self.token));
-        until("the page is live", || {
-            browser.value("document.getElementById('state').textContent") == "live"
-        });
-        Some(browser)
+        Browser::open_page(name, (width, height), (self.address, &self.token))
     }
 }
 
@@ -395,10 +390,6 @@ fn rows(browser: &Browser) -> Vec<String> {
         .collect()
 }
 
-fn assert_no_messages(browser: &Browser) {
-    assert_eq!(browser.messages(), Vec::<String>::new());
-}
-
 #[test]
 fn the_page_shows_the_agents_that_run_and_those_that_have_ended() {
     let host = Host::new();
@@ -448,7 +439,7 @@ fn the_page_shows_the_agents_that_run_and_those_that_have_ended() {
             .iter()
             .any(|row| row.starts_with("depot") && !row.contains("ended"))
     );
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
 
     // Markup from a script is impossible.
     let refused = "(() => { try { document.body.innerHTML = 'x'; return 'set'; } catch { return 'refused'; } })()";
@@ -514,7 +505,7 @@ fn a_violated_conversation_is_first_and_drawn_with_its_violation() {
     });
     // The page fits a telephone: what is wider scrolls in its own box.
     assert_eq!(browser.value("document.documentElement.scrollWidth"), 390);
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
 }
 
 #[test]
@@ -555,7 +546,7 @@ fn locks_have_their_holders_and_lost_hosts_stay_in_sight() {
             .iter()
             .any(|row| row.starts_with("bay fipa-lock-"))
     });
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
 }
 
 /// The SHA-256 of the certificate that a listener presents.
@@ -621,7 +612,7 @@ fn other_hosts_reach_the_page_with_the_key_of_the_gateway_only() {
             (&cookie["secure"], &cookie["httpOnly"], &cookie["sameSite"]),
             (&true.into(), &true.into(), &"Strict".into())
         );
-        assert_no_messages(&browser);
+        browser.assert_no_messages();
         let _ = shown.gateway.signal("-INT");
     }
 }
@@ -716,7 +707,7 @@ fn clients_send_messages_only_with_control_and_as_an_agent_of_the_host() {
     browser.wait_for("crane: delivered");
     let received: Value = serde_json::from_str(&crane.line()).unwrap();
     assert_eq!(received["message"]["content"], "from the page");
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
 }
 
 #[test]
@@ -846,5 +837,5 @@ fn soak() {
             browser.value("document.querySelector('.totals').innerText.replaceAll('\\n', ' ')"),
         );
     }
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
 }

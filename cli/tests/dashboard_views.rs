@@ -11,7 +11,6 @@ mod common;
 mod listener;
 
 use std::fs;
-use std::io::{Read as _, Write as _};
 use std::process::Stdio;
 
 use browser::Browser;
@@ -28,22 +27,10 @@ const PNG: &[u8] = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x01\0\0\0\x01\x08\x02\0
 impl Shown {
     /// Asks for a path. Returns the status, the head of the answer in lower case, and the body.
     fn bytes(&self, path: &str, headers: &str) -> (u16, String, Vec<u8>) {
-        let mut stream = self.connect();
-        let request = format!(
-            "GET {path} HTTP/1.1\r\nHost: {}\r\n{headers}\r\n",
-            self.address
-        );
-        stream.write_all(request.as_bytes()).unwrap();
-        let mut answer = Vec::new();
-        stream.read_to_end(&mut answer).unwrap();
-        let end = answer.windows(4).position(|it| it == b"\r\n\r\n").unwrap();
-        let head = String::from_utf8(answer[..end].to_vec()).unwrap();
-        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
-        (
-            status,
-            head.to_ascii_lowercase(),
-            answer[end + 4..].to_vec(),
-        )
+        let address = self.address;
+        let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n{headers}\r\n");
+        let (status, head, body) = self.exchange_bytes(&request);
+        (status, head.to_ascii_lowercase(), body)
     }
 
     fn status(&self, path: &str) -> u16 {
@@ -57,12 +44,8 @@ impl Shown {
     }
 
     /// Opens a view in a browser.
-    fn open(&self, name: &str, (width, height): (u32, u32), view: &str) -> Option<Browser> {
-        let browser = Browser::open(name, width, height)?;
-        browser.go_to(&format!("http://{}/#token={}", self.address, self.token));
-        until("the page is live", || {
-            browser.value("document.getElementById('state').textContent") == "live"
-        });
+    fn open(&self, name: &str, size: (u32, u32), view: &str) -> Option<Browser> {
+        let browser = Browser::open_page(name, size, (self.address, &self.token))?;
         go(&browser, view);
         Some(browser)
     }
@@ -81,10 +64,6 @@ fn rows(browser: &Browser, caption: &str) -> Vec<String> {
     let rows = rows.as_array().unwrap().iter();
     rows.map(|row| row.as_str().unwrap().replace(['\n', '\t'], " "))
         .collect()
-}
-
-fn assert_no_messages(browser: &Browser) {
-    assert_eq!(browser.messages(), Vec::<String>::new());
 }
 
 /// Number of subscribers of a topic, as its publisher counts.
@@ -168,7 +147,7 @@ fn an_agent_is_shown_with_its_services_and_the_newest_values_of_its_topics() {
         subscribers(&host, "battery", "charge") == 0
     });
     until("no image", || shown.status(path) == 404);
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
 }
 
 #[test]
@@ -229,7 +208,7 @@ fn four_topics_of_an_agent_are_followed_and_any_other_one_on_demand() {
     let rows = rows(&browser, "Topics");
     assert_eq!(rows.len(), 6);
     assert!(rows[3].contains("Follow t3"), "{rows:?}");
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
     drop(publishers);
 }
 
@@ -266,7 +245,7 @@ fn coalitions_are_groups_with_their_leader() {
     assert_eq!(browser.value("document.documentElement.scrollWidth"), 390);
     go(&browser, "agent/platoon");
     browser.wait_for("Members: rover (leader), arm, ghost");
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
 }
 
 /// Sends a letter of a conversation.
@@ -351,5 +330,5 @@ fn a_slider_shows_the_letters_and_agents_of_a_time() {
     until("the present", || {
         !names().contains("crane") && letters().contains("late")
     });
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
 }

@@ -819,13 +819,18 @@ fn letters_beyond_the_share_of_a_receiver_wait_and_those_for_others_pass() {
     assert!(!core.has_open_letters());
 }
 
-#[test]
-fn letters_beyond_the_share_of_an_address_fail_and_those_of_another_wait() {
+/// A gateway with the agent `echo` and a mebibyte for letters in custody.
+fn core_with_a_mebibyte() -> Core {
     let config = CoreConfig {
         custody_bytes: 1 << 20,
         ..gateway(&[Kind::Shm, Kind::Tcp])
     };
-    let mut core = Core::new(config, host_of_all(&["echo"]).view());
+    Core::new(config, host_of_all(&["echo"]).view())
+}
+
+#[test]
+fn letters_beyond_the_share_of_an_address_fail_and_those_of_another_wait() {
+    let mut core = core_with_a_mebibyte();
     let begun = now();
     let deadline = Duration::from_secs(60);
     let failed_of = |core: &mut Core, address: IpAddr, letters: usize| {
@@ -859,11 +864,7 @@ fn letters_beyond_the_share_of_an_address_fail_and_those_of_another_wait() {
 
 #[test]
 fn letters_that_wait_for_a_receiver_fail_at_their_deadline() {
-    let config = CoreConfig {
-        custody_bytes: 1 << 20,
-        ..gateway(&[Kind::Shm, Kind::Tcp])
-    };
-    let mut core = Core::new(config, host_of_all(&["echo"]).view());
+    let mut core = core_with_a_mebibyte();
     let begun = now();
     for number in 0..300 {
         let mut unframed = read(

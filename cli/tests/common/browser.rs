@@ -5,7 +5,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use fipa_testbed::{ChildGuard, can_run, until_some};
+use fipa_testbed::{ChildGuard, can_run, until, until_some};
 use serde_json::{Value, json};
 
 /// Timeout for hanging tests.
@@ -83,6 +83,20 @@ impl Browser {
         );
     }
 
+    /// Opens the page of a gateway with its token in a window of this size, and waits until it is live.
+    pub(crate) fn open_page(
+        name: &str,
+        (width, height): (u32, u32),
+        (address, token): (SocketAddr, &str),
+    ) -> Option<Self> {
+        let browser = Self::open(name, width, height)?;
+        browser.go_to(&format!("http://{address}/#token={token}"));
+        until("the page is live", || {
+            browser.value("document.getElementById('state').textContent") == "live"
+        });
+        Some(browser)
+    }
+
     pub(crate) fn go_to(&self, address: &str) {
         self.command("/url", &json!({ "url": address }));
     }
@@ -125,6 +139,10 @@ impl Browser {
         entries
             .map(|entry| entry["message"].as_str().unwrap().to_owned())
             .collect()
+    }
+
+    pub(crate) fn assert_no_messages(&self) {
+        assert_eq!(self.messages(), Vec::<String>::new());
     }
 
     fn command(&self, path: &str, body: &Value) -> Value {

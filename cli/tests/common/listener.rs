@@ -44,13 +44,22 @@ impl Shown {
 
     /// Sends a request. Returns the status, the headers, and the body of the answer.
     pub(crate) fn exchange(&self, request: &str) -> (u16, String, String) {
+        let (status, head, body) = self.exchange_bytes(request);
+        (status, head, String::from_utf8(body).unwrap())
+    }
+
+    /// The same with a body of bytes.
+    pub(crate) fn exchange_bytes(&self, request: &str) -> (u16, String, Vec<u8>) {
         let mut stream = self.connect();
         stream.write_all(request.as_bytes()).unwrap();
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).unwrap();
-        let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).unwrap();
+        let end = answer.windows(4).position(|it| it == b"\r\n\r\n").unwrap();
+        let body = answer.split_off(end + 4);
+        answer.truncate(end);
+        let head = String::from_utf8(answer).unwrap();
         let status = head.split(' ').nth(1).unwrap().parse().unwrap();
-        (status, head.to_owned(), body.to_owned())
+        (status, head, body)
     }
 
     /// The header with the token.

@@ -114,7 +114,7 @@ fn a_running_action_is_seen_and_cancelled_from_the_page() {
                 rows(browser).iter().any(wanted)
             });
             assert_eq!(browser.value("document.documentElement.scrollWidth"), 390);
-            assert_no_messages(browser);
+            browser.assert_no_messages();
         }
         None => {
             let answer = shown.ask("POST", "/api/cancel", &headers, &order("crex"));
@@ -156,5 +156,5 @@ fn a_page_without_control_shows_actions_and_cancels_none() {
     );
     assert_eq!(goal(&shown, "crex")["state"], "executing");
     assert!(!driving.has_ended());
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
 }

@@ -58,7 +58,7 @@ fn the_docking_demo_is_followed_live() {
         let all = ["crex", "payload_1", "payload_2"];
         all.iter().all(|member| members.contains(member))
     });
-    assert_no_messages(&browser);
+    browser.assert_no_messages();
     demo.write_line("");
     let (code, log) = demo.end();
     assert_eq!(code, Some(0), "{log}");

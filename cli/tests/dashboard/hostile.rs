@@ -111,7 +111,7 @@ fn slow_and_endless_requests_end_and_keep_no_client_out() {
                 format!("POST /api/send HTTP/1.1\r\n{fields}Transfer-Encoding: chunked\r\n\r\n");
             fast.write_all(head.as_bytes()).unwrap();
             let chunk = format!("1000\r\n{}\r\n", "a".repeat(0x1000));
-            // What is written and not read is in buffers of the system.
+            // The buffers of the system hold the bytes that the gateway does not read.
             let written = write_until_closed(&mut fast, chunk.as_bytes(), Duration::ZERO);
             assert!(written < 64 << 20, "{written} bytes were taken");
         }

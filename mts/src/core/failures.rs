@@ -87,35 +87,23 @@ impl Core {
     /// Sends the pending FIPA `failure` messages.
     pub(super) fn send_failures(&mut self, now: Now) {
         while let Some(undelivered) = self.table.undelivered.pop_front() {
-            let Undelivered {
-                sender,
-                receiver,
-                letter,
-                reason,
-                detail,
-                count,
-            } = undelivered;
             let name = Arc::clone(&self.table.config.name);
             let name = &*name;
-            let from = match &sender {
+            let from = match &undelivered.sender {
                 FailureTarget::LegacyPeer { from, .. } => Some(*from),
                 FailureTarget::Ours(_) | FailureTarget::Remote(_) => None,
             };
             let address = from.map(|from| from.address);
-            let failed = match &sender {
+            let failed = match &undelivered.sender {
                 FailureTarget::LegacyPeer { failed, .. } | FailureTarget::Remote(failed) => {
+                    let failed = Arc::clone(failed);
                     let named = failed.sender.name();
                     if !self.failure_limit.allows(now.instant, address, named) {
-                        let later = Undelivered {
-                            sender: sender.clone(),
-                            receiver,
-                            letter,
-                            reason,
-                            detail,
-                            count,
-                        };
-                        let of = from.map(|from| (from, failed));
-                        if of.is_some_and(|of| self.summaries.add(now.instant, of, later)) {
+                        let is_added = from.is_some_and(|from| {
+                            self.summaries
+                                .add(now.instant, (from, &failed), undelivered)
+                        });
+                        if is_added {
                             log_limit::warn!(
                                 of: address.map(quota_address),
                                 "failure messages beyond a limit are counted in one message to their sender"
@@ -126,16 +114,25 @@ impl Core {
                         continue;
                     }
                     // Failure messages are encoded only in proportion to the received bytes.
-                    if !self.failure_limit.covers(address, letter.len()) {
+                    let len = undelivered.letter.len();
+                    if !self.failure_limit.covers(address, len) {
                         continue;
                     }
-                    Some(Arc::clone(failed))
+                    Some(failed)
                 }
-                FailureTarget::Ours(_) => Failed::of(&letter).map(Arc::new),
+                FailureTarget::Ours(_) => Failed::of(&undelivered.letter).map(Arc::new),
             };
             let Some(failed) = failed else {
                 continue;
             };
+            let Undelivered {
+                sender,
+                receiver,
+                reason,
+                detail,
+                count,
+                ..
+            } = undelivered;
             let report = Failure {
                 letter: &failed,
                 receiver: &receiver,

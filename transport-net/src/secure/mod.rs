@@ -32,6 +32,8 @@ use std::time::{Duration, SystemTime};
 use parking_lot::{Mutex, RwLock};
 use rustls::client::Resumption;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::server::NoClientAuth;
+use rustls::server::danger::ClientCertVerifier;
 use rustls::version::TLS13;
 use rustls::{ClientConfig, ServerConfig};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -102,6 +104,8 @@ struct Prepared {
     known: Arc<Known>,
     key_log: Arc<dyn rustls::KeyLog>,
     server: Arc<ServerConfig>,
+    /// For clients that prove nothing.
+    client_server: Arc<ServerConfig>,
     client: Arc<ClientConfig>,
 }
 
@@ -228,14 +232,8 @@ impl Security {
     #[cfg(feature = "http")]
     pub(crate) fn platform_server(&self) -> Result<Arc<ServerConfig>, rustls::Error> {
         let now = self.now.read().clone();
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let mut server = ServerConfig::builder_with_provider(provider)
-            .with_protocol_versions(&[&TLS13])?
-            .with_client_cert_verifier(Arc::new(platform::AnyClient::new(&now.known)))
-            .with_single_cert(vec![now.own.der().clone()], now.key.clone_key())?;
-        server.send_tls13_tickets = 0;
-        server.key_log = Arc::clone(&now.key_log);
-        Ok(Arc::new(server))
+        let verifier = Arc::new(platform::AnyClient::new(&now.known));
+        server(verifier, &now.own, &now.key, &now.key_log)
     }
 
     /// Returns the configuration of TLS with a platform that is dialed. It proves its identity with a
@@ -263,17 +261,8 @@ impl Security {
         self,
         stream: TcpStream,
     ) -> io::Result<impl AsyncRead + AsyncWrite + Unpin + Send + 'static> {
-        let now = self.now.read().clone();
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let mut server = ServerConfig::builder_with_provider(provider)
-            .with_protocol_versions(&[&TLS13])
-            .map_err(io::Error::other)?
-            .with_no_client_auth()
-            .with_single_cert(vec![now.own.der().clone()], now.key.clone_key())
-            .map_err(io::Error::other)?;
-        server.send_tls13_tickets = 0;
-        server.key_log = Arc::clone(&now.key_log);
-        TlsAcceptor::from(Arc::new(server)).accept(stream).await
+        let server = Arc::clone(&self.now.read().client_server);
+        TlsAcceptor::from(server).accept(stream).await
     }
 
     /// Returns the trust in a peer that has presented these certificates in a handshake. `None` if the
@@ -388,28 +377,42 @@ impl Prepared {
     ) -> Result<Self, CredentialsError> {
         let provider = Arc::new(rustls::crypto::ring::default_provider());
         let chain = vec![own.der().clone()];
-        let mut server = ServerConfig::builder_with_provider(provider.clone())
-            .with_protocol_versions(&[&TLS13])?
-            .with_client_cert_verifier(known.clone())
-            .with_single_cert(chain.clone(), key.clone_key())?;
+        let anyone = Arc::new(NoClientAuth);
         let mut client = ClientConfig::builder_with_provider(provider)
             .with_protocol_versions(&[&TLS13])?
             .dangerous()
             .with_custom_certificate_verifier(known.clone())
             .with_client_auth_cert(chain, key.clone_key())?;
         // A resumed session would skip the check whether the peer is still trusted.
-        server.send_tls13_tickets = 0;
         client.resumption = Resumption::disabled();
         client.enable_sni = false;
-        server.key_log = Arc::clone(key_log);
         client.key_log = Arc::clone(key_log);
         Ok(Self {
+            server: server(known.clone(), &own, &key, key_log)?,
+            client_server: server(anyone, &own, &key, key_log)?,
             own,
             key,
             known,
             key_log: Arc::clone(key_log),
-            server: Arc::new(server),
             client: Arc::new(client),
         })
     }
+}
+
+/// The configuration of TLS with peers that dial, whose certificates this verifier judges.
+fn server(
+    verifier: Arc<dyn ClientCertVerifier>,
+    own: &Certificate,
+    key: &PrivateKeyDer<'static>,
+    key_log: &Arc<dyn rustls::KeyLog>,
+) -> Result<Arc<ServerConfig>, rustls::Error> {
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let mut server = ServerConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&TLS13])?
+        .with_client_cert_verifier(verifier)
+        .with_single_cert(vec![own.der().clone()], key.clone_key())?;
+    // A resumed session would skip the check whether the peer is still trusted.
+    server.send_tls13_tickets = 0;
+    server.key_log = Arc::clone(key_log);
+    Ok(Arc::new(server))
 }

@@ -163,10 +163,10 @@ async fn follow(
     domain: &Domain,
     checker: Checker,
 ) -> Result<bool, Failure> {
-    let asker = membership::asker(domain).await?;
-    let locks_asker = Arc::new(register(domain, config).await?);
+    let status_asker = membership::asker(domain).await?;
+    let asker = Arc::new(register(domain, config).await?);
     let robots = Robots::default();
-    let own = vec![asker.name().to_owned(), locks_asker.name().to_owned()];
+    let own = vec![status_asker.name().to_owned(), asker.name().to_owned()];
     let watcher = Watcher::open(config, WatchOptions::default()).await;
     let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
     let mut observer = Observer::new(WINDOW, checker, own, config, &watcher);
@@ -199,10 +199,10 @@ async fn follow(
     };
     let is_stopped = tokio::select! {
         () = watching => false,
-        () = top::ask(asker, sender) => false,
-        () = ask_for_locks(observation, &locks_asker, locks_sender) => false,
-        () = offers::serve(&observation.offers, &locks_asker) => false,
-        () = ask_for_goals(observation, &robots, &locks_asker) => false,
+        () = top::ask(status_asker, sender) => false,
+        () = ask_for_locks(observation, &asker, locks_sender) => false,
+        () = offers::serve(&observation.offers, &asker) => false,
+        () = ask_for_goals(observation, &robots, &asker) => false,
         () = observation.orders.serve(domain, config) => false,
         () = observation.stopped.notified() => true,
     };
