@@ -408,11 +408,11 @@ fn names(view: &View, bodies: &[Placed<'_>], out: &mut Canvas) {
             continue;
         };
         taken.push(label);
-        let (aside, down) = (name_x - x, name_y - y);
-        let distance = aside.hypot(down);
-        if distance > reach + half + 24.0 {
-            let begin = (x + aside * reach / distance, y + down * reach / distance);
-            out.line(begin, (name_x, name_y), Paint::edge(placed.body.color, 1.0));
+        if own.is_none() {
+            // From the inside of the body, because bodies can touch.
+            let begin = ((x + x + name_x) / 3.0, (y + y + name_y) / 3.0);
+            let begin = if reach < 12.0 { (x, y) } else { begin };
+            out.line(begin, (name_x, name_y), Paint::edge(Color::INK, 1.0));
         }
         let font = Font::new(LABEL).bold().anchor(Anchor::Middle).cover(cover);
         out.text((name_x, name_y + 5.0), font, &name);

@@ -21,6 +21,10 @@ const GAP: f64 = 4.0;
 const LINE: f64 = 18.0;
 const LABEL: f64 = 14.0;
 const SMALL: f64 = 13.0;
+/// Minimum width of the column of names: the timelines of a page with short names have equal axes.
+const MIN_NAMES: f64 = 100.0;
+/// Maximum width of the column of names.
+const MAX_NAMES: f64 = 190.0;
 
 /// A timeline.
 ///
@@ -138,7 +142,7 @@ impl Timeline {
     pub(crate) fn canvas(&self, wide: f64) -> Canvas {
         let rows = self.rows.get(..MAX_ROWS).unwrap_or(&self.rows);
         let names = rows.iter().map(|row| width(&row.name, LABEL, true));
-        let names = names.fold(0.0, f64::max).min(190.0);
+        let names = names.fold(0.0, f64::max).clamp(MIN_NAMES, MAX_NAMES);
         let left = MARGIN + names + 12.0;
         let right = wide - MARGIN - 8.0;
         let scale = Scale::linear(self.span(), (left, right));
@@ -241,7 +245,8 @@ fn draw_row(
     let left_out = row.intervals.len() - bars.len();
     let lanes = bars.iter().map(|bar| bar.lane + 1).max().unwrap_or(1) as f64;
     let top = out.height + GAP;
-    let name = name_lines(&row.name, LABEL, left - MARGIN - 12.0);
+    // One more: the sum of the widths is rounded.
+    let name = name_lines(&row.name, LABEL, left - MARGIN - 11.0);
     for (at, line) in name.iter().enumerate() {
         let y = top + 17.0 + at as f64 * LINE;
         texts.text((MARGIN + 4.0, y), Font::new(LABEL).bold(), line);

@@ -21,28 +21,31 @@ pub fn page(reports: &[Report]) -> Page {
     let run = Run::of(reports);
     let (fault, seed) = run.started();
     let fault = if fault == "none" {
-        "no fault".to_owned()
+        "No fault".to_owned()
     } else {
-        format!("fault: {fault}")
+        format!("Fault: {fault}")
     };
     Page {
         title: "A stack of two items on crex".to_owned(),
-        text: format!("Two robots fetch, reserve and dock two payload items, and become one; {fault}, seed {seed}"),
+        text: format!(
+            "sherpa, the master of each docking, drives crex to two payload items, which latch on to crex one after the \
+             other; the three become the robot crex_stack. {fault}, seed {seed}"
+        ),
         sections: vec![
             Section {
-                text: "True poses in meters. A line is the way of a body.".to_owned(),
+                text: "Poses in meters, as the simulated world has them. A line is the way of a body; one without a line stands still.".to_owned(),
                 ..Section::new("The plane", run.plane())
             },
             Section {
-                text: "Seconds since the operator searched. A bar is the robot that a body belongs to.".to_owned(),
+                text: "Seconds since an operator searched for robots. A bar is the robot that a body belongs to.".to_owned(),
                 ..Section::new("Who belongs to what", run.members())
             },
             Section {
-                text: "A bar is a grant: its holder, and the number of its fence.".to_owned(),
+                text: "The same seconds. A bar is a grant: its holder, and the number that rises with each grant (its fence).".to_owned(),
                 ..Section::new("Locks", run.locks())
             },
             Section {
-                text: "The letters of the protocol dock, and those that break it.".to_owned(),
+                text: "The letters of one conversation of the protocol dock, not to scale: the first docking that failed, or the first.".to_owned(),
                 ..Section::new("One docking", run.docking())
             },
         ],
@@ -290,7 +293,7 @@ impl<'a> Run<'a> {
                 }
                 Claim::Refused { action, .. } => Some(Step::Note(Note {
                     lane: it.by.clone(),
-                    text: format!("refuses to {action}: its fence is stale"),
+                    text: format!("{} refuses to {action}: old fence", it.by),
                     time: time(it.at),
                 })),
                 _ => None,
