@@ -120,7 +120,7 @@ async fn each_letter_yields_one_event_with_its_outcome() {
         (Some(13), 0),
         "content is not included by default"
     );
-    let envelope = seen.envelope.as_ref().unwrap();
+    let envelope = seen.envelope.get().unwrap();
     assert_eq!(envelope.base.from.as_ref().unwrap().name(), "rover");
     assert_eq!(seen.via, Some(Kind::Shm));
     assert!(matches!(

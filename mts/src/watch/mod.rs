@@ -9,8 +9,10 @@
 //!
 //! No I/O and no clock: the crate `fipa` has the socket between the two.
 
+mod envelope;
 mod joiner;
 pub mod record;
 
+pub use envelope::SeenEnvelope;
 pub use joiner::{Event, Fate, Joiner, Passage, RecordSource};
 pub use record::{Record, RecordError};

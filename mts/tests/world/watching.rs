@@ -32,7 +32,7 @@ impl Watching {
     ) -> Result<(), Breach> {
         // The content begins with the number of the letter.
         let bytes = record::of(notice, Wish { content: 64 }, utc);
-        let record = Record::parse(&bytes.into()).map_err(|error| error.to_string())?;
+        let record = Record::parse(&bytes).map_err(|error| error.to_string())?;
         self.joiner
             .handle(now, RecordSource(process as u64), record);
         while let Some(event) = self.joiner.poll_event(now) {

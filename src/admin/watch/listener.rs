@@ -7,7 +7,6 @@ use std::io::ErrorKind;
 use std::os::unix::net::UnixDatagram;
 use std::time::Duration;
 
-use bytes::Bytes;
 use fipa_mts::watch::record::{MAX_LEN, Wish};
 use fipa_mts::watch::{Record, RecordError, RecordSource};
 use fipa_transport::{DomainUsers, log_limit};
@@ -157,7 +156,7 @@ fn take_records(socket: &UnixDatagram, buffer: &mut [u8], records: &mut Vec<Reco
             Err(_) => return Batch::End,
         };
         taken += bytes.len();
-        match Record::parse(&Bytes::copy_from_slice(bytes)) {
+        match Record::parse(bytes) {
             Ok(record) => records.push(record),
             Err(why) => return Batch::Malformed(why),
         }

@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 use fipa_acl::ErrorChain;
 use fipa_mts::watch::Joiner;
 use fipa_mts::watch::record::{MAX_CONTENT, Wish};
-pub use fipa_mts::watch::{Event, Fate, Passage, RecordError};
+pub use fipa_mts::watch::{Event, Fate, Passage, RecordError, SeenEnvelope};
 use fipa_sds::{Cancellation, Directory, HostDirectory, Reach};
 use fipa_transport::{Incarnation, log_limit};
 use tokio::sync::mpsc;

@@ -102,7 +102,7 @@ impl<'a> Letter<'a> {
 /// differ from that of this host.
 fn answer_within(passage: &Passage) -> Option<Duration> {
     let by = passage.message.as_ref()?.reply_by()?;
-    by.span_since(passage.envelope.as_ref()?.effective().date?)
+    by.span_since(passage.envelope.get()?.effective().date?)
 }
 
 /// Whether a service of another host, which sends no records, probably wrote the letter.

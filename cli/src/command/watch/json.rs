@@ -175,7 +175,7 @@ pub(in crate::command) fn message(passage: &Passage) -> Option<Message> {
 /// The observed parts of the letter, in the format of `fipa decode`.
 fn contents(passage: &Passage) -> Value {
     let message = message(passage);
-    let mut letter = match &passage.envelope {
+    let mut letter = match passage.envelope.get() {
         Some(envelope) => letter_to_json(envelope, &fipa::Payload::default()),
         None => json!({}),
     };

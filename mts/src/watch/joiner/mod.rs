@@ -11,9 +11,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
-use fipa_acl::{Envelope, Message};
+use fipa_acl::Message;
 use fipa_transport::{Incarnation, Kind, Outcome, Stream};
 
+use super::envelope::SeenEnvelope;
 use super::record::{LetterId, Origin, Record, RecordBody, RecordError, Seen, SeenLetter};
 
 /// Minimum time for which a letter is held back: records of earlier letters may still arrive.
@@ -50,8 +51,8 @@ pub struct Passage {
     pub submission: Option<u64>,
     /// Name of the receiver.
     pub receiver: Arc<str>,
-    /// Its envelope, unless it is too long or malformed.
-    pub envelope: Option<Envelope>,
+    /// Its envelope.
+    pub envelope: SeenEnvelope,
     /// Its message without content, unless it is too long or malformed.
     pub message: Option<Message>,
     /// Length of the content in bytes, if the message has content.
@@ -87,12 +88,10 @@ impl Passage {
     #[must_use]
     pub fn sender(&self) -> Option<&str> {
         let said = self.message.as_ref().and_then(Message::sender);
-        let envelope = self.envelope.as_ref();
         let written = || {
-            envelope.and_then(|it| {
-                let newest_first = it.extensions.iter().rev().chain([&it.base]);
-                newest_first.filter_map(|part| part.from.as_ref()).next()
-            })
+            let envelope = self.envelope.get()?;
+            let newest_first = envelope.extensions.iter().rev().chain([&envelope.base]);
+            newest_first.filter_map(|part| part.from.as_ref()).next()
         };
         said.or_else(written).map(fipa_acl::AgentId::name)
     }
@@ -266,9 +265,8 @@ impl Joiner {
         if self.settled.contains(&key) {
             return;
         }
-        let content = letter.content.clone();
         if !self.letters.contains_key(&key) {
-            self.begin(now, at, key, id, letter);
+            self.begin(now, at, key, id, &letter);
         }
         let Some(known) = self.letters.get_mut(&key) else {
             return;
@@ -276,7 +274,7 @@ impl Joiner {
         let before = known.passage.fate.clone();
         // A process that has just started may not have the request for content yet.
         if known.passage.content.is_empty() && !known.reported {
-            known.passage.content = content;
+            known.passage.content = letter.content();
         }
         known.see(seen, gateway);
         if matches!(seen, Seen::Sent(_))
@@ -295,7 +293,7 @@ impl Joiner {
         }
     }
 
-    fn begin(&mut self, now: Instant, at: SystemTime, key: Key, id: LetterId, letter: SeenLetter) {
+    fn begin(&mut self, now: Instant, at: SystemTime, key: Key, id: LetterId, letter: &SeenLetter) {
         self.arrived += 1;
         let place = (at, self.arrived);
         let mut passage = Passage {
@@ -304,11 +302,11 @@ impl Joiner {
             stream: id.stream,
             sequence: id.sequence,
             submission: None,
-            receiver: id.receiver,
-            envelope: letter.decode_envelope(),
+            receiver: letter.receiver().into(),
+            envelope: letter.envelope(),
             message: letter.decode_message(),
             content_len: letter.content_len,
-            content: letter.content,
+            content: letter.content(),
             size: letter.size,
             via: None,
             gateway: None,
@@ -429,6 +427,7 @@ impl Joiner {
         let passage = Arc::new(known.passage.clone());
         // The content has been reported and is not kept.
         known.passage.content = Bytes::new();
+        known.passage.envelope = passage.envelope.alone();
         known.reported = true;
         self.letters.insert(key, known);
         Some(Event::Letter(passage))

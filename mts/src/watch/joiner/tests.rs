@@ -1,9 +1,11 @@
 use std::time::UNIX_EPOCH;
 
-use fipa_acl::{AgentId, Performative};
+use fipa_acl::{AgentId, Letter, Performative};
 use fipa_transport::FailureReason;
 
+use super::super::record::{Wish, of};
 use super::*;
+use crate::core::{News, Notice};
 
 const A: RecordSource = RecordSource(1);
 const B: RecordSource = RecordSource(2);
@@ -13,7 +15,6 @@ fn id(sender: u64, sequence: u64) -> LetterId {
     LetterId {
         stream: Stream::between(Incarnation::from_u64(sender), Incarnation::from_u64(99)),
         sequence,
-        receiver: "arm_1".into(),
     }
 }
 
@@ -22,13 +23,21 @@ fn letter() -> SeenLetter {
         .sender(AgentId::new("rover").unwrap())
         .build()
         .unwrap();
-    SeenLetter {
-        envelope: Bytes::new(),
-        message: message.to_payload().to_bytes(),
-        content_len: None,
-        content: Bytes::new(),
-        size: 100,
-    }
+    let LetterId { stream, sequence } = id(7, 1);
+    let notice = Notice {
+        stream,
+        sequence,
+        receiver: "arm_1".into(),
+        news: News::Taken {
+            via: None,
+            letter: Letter::new(Bytes::new(), message.to_payload()),
+        },
+    };
+    let record = Record::parse(&of(&notice, Wish::default(), at(0))).unwrap();
+    let RecordBody::Letter { letter, .. } = record.body else {
+        panic!("not a letter");
+    };
+    letter
 }
 
 fn at(ms: u64) -> SystemTime {

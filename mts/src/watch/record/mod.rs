@@ -16,11 +16,12 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
-use fipa_acl::{Envelope, Letter, Message};
+use fipa_acl::{Letter, Message};
 use fipa_transport::{Incarnation, Kind, Outcome, Parcel, Stream, wire};
 use zerocopy::little_endian::{U32, U64};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
+use super::envelope::SeenEnvelope;
 use crate::core::{News, Notice};
 
 /// Largest record, in bytes.
@@ -127,14 +128,12 @@ pub enum RecordBody {
 }
 
 /// Identifies one letter to one receiver at all points of its route.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LetterId {
     /// Its stream.
     pub stream: Stream,
     /// Sequence number of the letter among all letters of the sender.
     pub sequence: u64,
-    /// The name of the receiver.
-    pub receiver: Arc<str>,
 }
 
 /// Point of the route at which a letter is reported; see [`News`].
@@ -161,14 +160,13 @@ pub enum Origin {
 /// first one only.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SeenLetter {
-    /// Its encoded envelope; empty if it is too long.
-    pub envelope: Bytes,
-    /// Its encoded message without content; empty if it is too long or malformed.
-    pub message: Bytes,
+    /// Name of the receiver, envelope, message and content.
+    parts: Bytes,
+    name_len: usize,
+    envelope_len: usize,
+    message_len: usize,
     /// Length of the content in bytes, if the message has content.
     pub content_len: Option<u64>,
-    /// The content or its beginning, up to the length that the watcher requested.
-    pub content: Bytes,
     /// Length of envelope and message in bytes, content included.
     pub size: u64,
 }
@@ -386,8 +384,8 @@ impl Record {
     ///
     /// # Errors
     /// Fails when the bytes are not a record of this version, or a part is malformed.
-    pub fn parse(bytes: &Bytes) -> Result<Self, RecordError> {
-        let (header, _) =
+    pub fn parse(bytes: &[u8]) -> Result<Self, RecordError> {
+        let (header, parts) =
             Header::read_from_prefix(bytes).map_err(|_| RecordError::NotARecord(bytes.len()))?;
         if header.magic != MAGIC {
             return Err(RecordError::NotARecord(bytes.len()));
@@ -400,27 +398,31 @@ impl Record {
             let found = bytes.len();
             return Err(RecordError::Length { announced, found });
         }
-        let mut rest = bytes.slice(HEADER_LEN..);
-        // The lengths add up, as checked above.
-        let [name, envelope, message, content, outcome] = header
-            .parts()
-            .map(|len| rest.split_to(rest.len().min(usize::try_from(len).unwrap_or(usize::MAX))));
+        let name = || name_of(beginning(parts, header.name_len));
         let body = match header.kind {
             HELLO => RecordBody::Hello {
-                name: name_of(&name)?,
+                name: name()?.into(),
                 incarnation: Incarnation::from_u64(header.sender.get()),
                 gateway: header.flags & GATEWAY != 0,
             },
-            SENT | TAKEN | PASSED => RecordBody::Letter {
-                id: header.id(&name)?,
-                place: header.place()?,
-                letter: header.letter(envelope, message, content)?,
-            },
-            SETTLED => RecordBody::Settled {
-                id: header.id(&name)?,
-                outcome: wire::read_outcome(&outcome).ok_or(RecordError::Part("outcome"))?,
-                sender: header.flags & SENDER != 0,
-            },
+            SENT | TAKEN | PASSED => {
+                name()?;
+                RecordBody::Letter {
+                    id: header.id(),
+                    place: header.place()?,
+                    letter: header.letter(parts)?,
+                }
+            }
+            SETTLED => {
+                name()?;
+                let before = parts.len() - beginning(parts, header.outcome_len).len();
+                let (_, outcome) = parts.split_at(before);
+                RecordBody::Settled {
+                    id: header.id(),
+                    outcome: wire::read_outcome(outcome).ok_or(RecordError::Part("outcome"))?,
+                    sender: header.flags & SENDER != 0,
+                }
+            }
             LOST => RecordBody::Lost,
             other => return Err(RecordError::Kind(other)),
         };
@@ -433,16 +435,21 @@ impl Record {
     }
 }
 
+/// The first bytes, at most all of them.
+fn beginning(bytes: &[u8], len: U32) -> &[u8] {
+    let len = usize::try_from(len.get()).unwrap_or(usize::MAX);
+    bytes.get(..len).unwrap_or(bytes)
+}
+
 impl Header {
-    fn id(&self, name: &[u8]) -> Result<LetterId, RecordError> {
-        Ok(LetterId {
+    fn id(&self) -> LetterId {
+        LetterId {
             stream: Stream::between(
                 Incarnation::from_u64(self.sender.get()),
                 Incarnation::from_u64(self.receiver.get()),
             ),
             sequence: self.sequence.get(),
-            receiver: name_of(name)?,
-        })
+        }
     }
 
     fn place(&self) -> Result<Seen, RecordError> {
@@ -456,48 +463,68 @@ impl Header {
         })
     }
 
-    fn letter(
-        &self,
-        envelope: Bytes,
-        message: Bytes,
-        content: Bytes,
-    ) -> Result<SeenLetter, RecordError> {
+    /// The letter with these parts, whose lengths add up.
+    fn letter(&self, parts: &[u8]) -> Result<SeenLetter, RecordError> {
         let content_len = (self.flags & CONTENT != 0).then(|| self.content_len.get());
-        if content.len() as u64 > content_len.unwrap_or(0) || content.len() > MAX_CONTENT {
+        let given = self.content_given.get();
+        if u64::from(given) > content_len.unwrap_or(0) || given as usize > MAX_CONTENT {
             return Err(RecordError::Part("content"));
         }
+        let [name_len, envelope_len, message_len, ..] = self.parts().map(|len| len as usize);
+        let outcome_len = self.outcome_len.get() as usize;
+        let letter = parts.get(..parts.len().saturating_sub(outcome_len));
         Ok(SeenLetter {
-            envelope,
-            message,
+            parts: Bytes::copy_from_slice(letter.unwrap_or(parts)),
+            name_len,
+            envelope_len,
+            message_len,
             content_len,
-            content,
             size: self.size.get(),
         })
     }
 }
 
 impl SeenLetter {
-    /// Decodes the envelope; `None` if it is too long or malformed.
+    /// The bytes between two ends, which lie within the parts.
+    fn part(&self, from: usize, len: usize) -> Bytes {
+        let until = from.saturating_add(len).min(self.parts.len());
+        self.parts.slice(from.min(until)..until)
+    }
+
+    /// The name of the receiver.
     #[must_use]
-    pub fn decode_envelope(&self) -> Option<Envelope> {
-        // Unchanged from the letter, and not yet checked as a whole.
-        let (decoded, len) = Envelope::decode(&self.envelope).ok()?;
-        (len == self.envelope.len()).then_some(decoded)
+    pub fn receiver(&self) -> &str {
+        let name = self.parts.get(..self.name_len).unwrap_or_default();
+        // It was checked when the record was parsed.
+        std::str::from_utf8(name).unwrap_or_default()
+    }
+
+    /// Its envelope; empty if it is too long.
+    #[must_use]
+    pub fn envelope(&self) -> SeenEnvelope {
+        self.part(self.name_len, self.envelope_len).into()
     }
 
     /// Decodes the message without content; `None` if it is too long or malformed.
     #[must_use]
     pub fn decode_message(&self) -> Option<Message> {
-        Message::decode(&self.message.clone().into()).ok()
+        let message = self.part(self.name_len + self.envelope_len, self.message_len);
+        Message::decode(&message.into()).ok()
+    }
+
+    /// The content or its beginning, up to the length that the watcher requested.
+    #[must_use]
+    pub fn content(&self) -> Bytes {
+        let before = self.name_len + self.envelope_len + self.message_len;
+        self.part(before, usize::MAX)
     }
 }
 
-fn name_of(name: &[u8]) -> Result<Arc<str>, RecordError> {
+fn name_of(name: &[u8]) -> Result<&str, RecordError> {
     if name.is_empty() || name.len() > Parcel::MAX_NAME {
         return Err(RecordError::Part("name"));
     }
-    let name = std::str::from_utf8(name).map_err(|_| RecordError::Part("name"))?;
-    Ok(name.into())
+    std::str::from_utf8(name).map_err(|_| RecordError::Part("name"))
 }
 
 impl Wish {

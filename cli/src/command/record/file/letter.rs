@@ -74,7 +74,7 @@ pub(in crate::command) fn to_json(
 /// Returns the bytes of an observed letter, envelope and message, if all of them were observed.
 pub(in crate::command) fn to_bytes(passage: &Passage) -> Option<BytesMut> {
     let is_whole = passage.content_len.unwrap_or(0) == passage.content.len() as u64;
-    let envelope = passage.envelope.as_ref().filter(|_| is_whole)?;
+    let envelope = passage.envelope.get().filter(|_| is_whole)?;
     let payload = json::message(passage)?.to_payload();
     let envelope = envelope.encode_standard().ok()?;
     let mut bytes = BytesMut::with_capacity(envelope.len() + payload.len());

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use bytes::Bytes;
+use fipa::admin::watch::SeenEnvelope;
 use fipa::{AgentId, Incarnation, Kind, Message, Performative};
 use fipa_transport::{FailureReason, Stream};
 
@@ -49,7 +50,7 @@ pub(in crate::command::top) fn named(
         sequence: number,
         submission: Some(number),
         receiver: Arc::from(receiver),
-        envelope: None,
+        envelope: SeenEnvelope::default(),
         message: Some(message.build().unwrap()),
         content_len: None,
         content: Bytes::new(),
