@@ -2,7 +2,6 @@
 //! orderly end on a signal.
 
 use std::io;
-use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,6 +9,7 @@ use clap::Args;
 use fipa::admin::contact;
 use fipa::admin::routes::{self, AskError, RouteReport};
 use fipa::admin::stopped::StoppedAgent;
+use fipa::admin::watch::{WatchOptions, Watcher};
 use fipa::config::{ConfigError, Reloaded};
 use fipa::error::{DomainDirError, ErrorChain, ListenError, OpenError, RegisterError, WebError};
 use fipa::threads::ThreadError;
@@ -68,6 +68,22 @@ impl Stop {
         while let SignalRequest::Reload = self.next_request().await {}
     }
 
+    /// Does work that may wait for another process, for example to join the domain. A signal ends it with an error;
+    /// dropping the future leaves the domain in order.
+    pub(crate) async fn during<T>(
+        &mut self,
+        work: impl Future<Output = Result<T, Failure>>,
+    ) -> Result<T, Failure> {
+        tokio::select! {
+            done = work => done,
+            () = self.requested() => Err(Failure::failed(
+                "canceled by a signal before the command was done",
+                "this process",
+                "run the command again",
+            )),
+        }
+    }
+
     /// Marks the start of the orderly end, which can take a while when another process delays it. A
     /// second signal ends the process at once; the next process of the domain removes the files that
     /// it leaves behind.
@@ -92,18 +108,7 @@ impl Stop {
 /// Runs work that ends by itself. A signal cancels it; dropping the future leaves the domain in
 /// order.
 pub(crate) fn run<T>(work: impl Future<Output = Result<T, Failure>>) -> Result<T, Failure> {
-    options::block_on(async {
-        let mut stop = Stop::listen()?;
-        let mut work = pin!(work);
-        tokio::select! {
-            done = &mut work => done,
-            () = stop.requested() => Err(Failure::failed(
-                "canceled by a signal before the command was done",
-                "this process",
-                "run the command again",
-            )),
-        }
-    })?
+    options::block_on(async { Stop::listen()?.during(work).await })?
 }
 
 /// Whether this process has a terminal. The kernel takes a closed terminal from all processes that were started from it.
@@ -159,6 +164,12 @@ pub(crate) fn report_reload(reloaded: &Result<Reloaded, ConfigError>) {
 pub(crate) async fn join_briefly(config: &Config) -> Result<Domain, Failure> {
     let joined = Domain::open_briefly(config).await;
     joined.map_err(|error| not_joined(error, config))
+}
+
+/// Watches the domain of the configuration.
+pub(crate) async fn watch(config: &Config, options: WatchOptions) -> Result<Watcher, Failure> {
+    let watcher = Watcher::open(config, options).await;
+    watcher.map_err(|error| not_joined(error, config))
 }
 
 /// The error report for a domain that cannot be joined or a gateway that cannot be started.
@@ -297,8 +308,8 @@ pub(crate) fn run_agent(
 ) -> Result<(), Failure> {
     options::block_on(async {
         let mut stop = Stop::listen()?;
-        let domain = join(config).await?;
-        let agent = register(&domain).await;
+        let domain = stop.during(join(config)).await?;
+        let agent = stop.during(register(&domain)).await;
         let done = match &agent {
             Ok(agent) => work(agent, &mut stop).await,
             Err(_) => Ok(()),

@@ -7,7 +7,7 @@ mod common;
 
 use std::env;
 use std::fs;
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::thread;
@@ -530,6 +530,56 @@ fn ping_names_a_stopped_process_first() {
     );
     assert!(error.contains(&format!(" help: {stopped}\n")), "{error}");
     arm.send_signal("-CONT");
+}
+
+/// Whether a process handles SIGINT by itself.
+fn handles_interrupts(pid: u32) -> bool {
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let caught = status.lines().find_map(|it| it.strip_prefix("SigCgt:"));
+    u64::from_str_radix(caught.unwrap().trim(), 16).unwrap() & 0b10 != 0
+}
+
+#[test]
+fn a_signal_ends_a_command_that_waits_for_the_directory() {
+    let host = Host::new();
+    let _arm = host.echo("arm");
+    let directory = host.path("run").join(&host.domain).join("directory");
+    // As a process that is stopped in the middle of a change.
+    let lock = fs::File::open(directory.join("lock")).unwrap();
+    lock.lock().unwrap();
+    let commands = [
+        vec!["agents", "--watch"],
+        vec!["coalition", "form", "pair", "arm"],
+        vec!["echo", "crane"],
+        vec!["listen", "crane"],
+        vec!["locks", "--watch"],
+        vec!["own", "bay", "--volatile"],
+        vec!["ping", "arm"],
+        vec!["record", "--output", "run.mcap"],
+        vec!["send", "arm", "hello", "--rate", "1"],
+        vec!["top"],
+        vec!["up"],
+        vec!["watch"],
+    ];
+    let waiting = commands.map(|arguments| {
+        let mut command = host.command(&arguments);
+        command.stdout(Stdio::null()).stderr(Stdio::piped());
+        (arguments, ChildGuard::start(&mut command))
+    });
+    for (arguments, mut child) in waiting {
+        let pid = child.child().id();
+        until("the command handles signals", || {
+            handles_interrupts(pid) || child.ended().is_some()
+        });
+        child.signal("-INT");
+        let mut said = String::new();
+        let mut errors = child.child().stderr.take().unwrap();
+        errors.read_to_string(&mut said).unwrap();
+        // `fipa locks --watch` ends with success, as always.
+        let is_ended = said.is_empty() && arguments[0] == "locks";
+        let is_canceled = said.contains("canceled by a signal");
+        assert!(is_ended || is_canceled, "{arguments:?}: {said}");
+    }
 }
 
 #[test]

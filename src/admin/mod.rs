@@ -4,6 +4,7 @@ pub mod contact;
 pub mod doctor;
 #[cfg(feature = "secure")]
 pub mod keys;
+mod member;
 pub mod open_files;
 #[cfg(feature = "secure")]
 pub mod pairing;

@@ -5,15 +5,13 @@
 //! [follow](crate::Domain::follow) a configuration answers so; the answer needs no cooperation of its program.
 
 use std::collections::{BTreeMap, HashSet};
-use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use fipa_acl::ErrorChain;
 use fipa_mts::watch::Record;
 use fipa_mts::watch::record::{MAX_LEN, RecordBody};
-use fipa_sds::{Cancellation, Directory, HostDirectory, Reach};
-use fipa_transport::{DomainUsers, Incarnation, log_limit};
+use fipa_sds::{Directory, HostDirectory, Reach};
+use fipa_transport::{DomainUsers, Incarnation};
 use serde::Serialize;
 use tokio::net::{UnixDatagram, UnixListener, UnixStream};
 use tokio::sync::mpsc;
@@ -21,12 +19,11 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout, timeout_at};
 
 use crate::Config;
+use crate::admin::member::Member;
 use crate::admin::watch::connection::RELOAD;
 use crate::admin::watch::reloading::read_answer;
 pub use crate::admin::watch::reloading::{ReloadAnswer, ReloadRequest, ReloadRequests};
 use crate::admin::watch::socket;
-use crate::domain::files::DomainDir;
-use crate::domain::membership::{self, Membership};
 use crate::error::OpenError;
 
 /// Time for all processes to answer. A stopped process does not answer.
@@ -56,31 +53,10 @@ pub struct ReloadedProcess {
 /// If the configuration, of which only the domain and its place matter, is invalid, or the directory of the domain
 /// cannot be used.
 pub async fn request(config: &Config) -> Result<Vec<ReloadedProcess>, OpenError> {
-    config.check()?;
-    tokio::runtime::Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
-    let name = format!("fipa-reload-{}", std::process::id());
-    let own = fipa_sds::MtsId::new(name, Incarnation::random());
-    let membership = Membership::default();
-    let (dir, host) = membership::join(config, &own, membership, &Cancellation::new())?;
-    let member = Member { dir, host };
+    let member = Member::join(config, "reload").await?;
     let socket = member.host.listen()?;
     let socket = socket::listening(socket).map_err(OpenError::Watch)?;
     Ok(collect(&member.host, socket).await)
-}
-
-/// A process in the directory of the domain. Dropping it leaves the domain.
-struct Member {
-    dir: DomainDir,
-    host: Arc<HostDirectory>,
-}
-
-impl Drop for Member {
-    fn drop(&mut self) {
-        if let Err(error) = self.host.close() {
-            log_limit::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");
-        }
-        self.dir.leave();
-    }
 }
 
 /// The name of a process's service, its incarnation, and whether it is the gateway.

@@ -50,7 +50,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let config = global.config()?;
     options::block_on(async {
         let mut stop = Stop::listen()?;
-        let domain = membership::join(&config).await?;
+        let domain = stop.during(membership::join(&config)).await?;
         let formed = form(&domain, &arguments).map_err(|error| match error {
             CoalitionError::Register(error) => {
                 membership::not_registered(error, arguments.name.name(), &config)

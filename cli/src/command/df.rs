@@ -265,10 +265,16 @@ async fn register(
     config: &Config,
 ) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
+    let domain = stop.during(membership::join(config)).await?;
     let done = async {
-        let agent =
-            membership::register(&domain, name.name(), RegisterOptions::default(), config).await?;
+        let agent = stop
+            .during(membership::register(
+                &domain,
+                name.name(),
+                RegisterOptions::default(),
+                config,
+            ))
+            .await?;
         let df = server.of(&agent, config).await?;
         let service_type = service.service_type.clone().unwrap_or_default();
         let registered = df.register_service(service).await;
@@ -422,7 +428,7 @@ async fn watch(
     config: &Config,
 ) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
+    let domain = stop.during(membership::join(config)).await?;
     let done = async {
         let agent = asking(&domain, "df", config).await?;
         let df = server.of(&agent, config).await?;

@@ -106,14 +106,15 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn perform(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
+    let domain = stop.during(membership::join(config)).await?;
     let done = async {
         let agent = match &arguments.agent {
             Some(id) => {
                 let options = RegisterOptions::default();
-                membership::register(&domain, id.name(), options, config).await?
+                stop.during(membership::register(&domain, id.name(), options, config))
+                    .await?
             }
-            None => asking(&domain, "do", config).await?,
+            None => stop.during(asking(&domain, "do", config)).await?,
         };
         let robot = arguments.addresses.of(&agent, &arguments.robot).await?;
         let robot = agent.robot(robot);

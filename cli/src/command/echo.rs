@@ -45,8 +45,10 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
-    let agent = arguments.receiver.register(&domain, config).await?;
+    let domain = stop.during(membership::join(config)).await?;
+    let agent = stop
+        .during(arguments.receiver.register(&domain, config))
+        .await?;
     if let Some((publisher, topic)) = options::of_publisher(agent.name()) {
         report::warn(&format!(
             "this agent answers messages; `fipa subscribe {publisher} {topic}` prints the values of a topic"

@@ -47,8 +47,10 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn listen(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
-    let agent = arguments.receiver.register(&domain, config).await?;
+    let domain = stop.during(membership::join(config)).await?;
+    let agent = stop
+        .during(arguments.receiver.register(&domain, config))
+        .await?;
     match arguments.json {
         true => output::json_line(&json!({ "agent": agent.name(), "domain": config.domain }))?,
         false => output::text(&format!(

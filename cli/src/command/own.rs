@@ -118,7 +118,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn own(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
+    let domain = stop.during(membership::join(config)).await?;
     let resource = arguments.resource;
     let name = match &arguments.agent {
         Some(id) => id.name().to_owned(),
@@ -128,7 +128,9 @@ async fn own(arguments: Arguments, config: &Config) -> Result<(), Failure> {
         agent_type: "fipa-own".to_owned(),
         ..RegisterOptions::default()
     };
-    let agent = membership::register(&domain, &name, options, config).await?;
+    let agent = stop
+        .during(membership::register(&domain, &name, options, config))
+        .await?;
     let begun = async {
         arguments.group.apply(&agent)?;
         let options = OwnOptions {

@@ -92,13 +92,15 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn ping(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
+    let domain = stop.during(membership::join(config)).await?;
     let name = format!("fipa-ping-{}", Incarnation::random());
     let options = RegisterOptions {
         agent_type: "fipa-ping".to_owned(),
         ..RegisterOptions::default()
     };
-    let agent = membership::register(&domain, &name, options, config).await?;
+    let agent = stop
+        .during(membership::register(&domain, &name, options, config))
+        .await?;
     let mut tally = Tally::default();
     let mut reader = Reader::of_output();
     let ended = tokio::select! {

@@ -66,8 +66,11 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let (dashboard, pages) = Dashboard::start(config);
-    let opened = Gateway::open_with_pages(config, pages).await;
-    let mut gateway = opened.map_err(|error| membership::not_joined(error, config))?;
+    let opened = async {
+        let opened = Gateway::open_with_pages(config, pages).await;
+        opened.map_err(|error| membership::not_joined(error, config))
+    };
+    let mut gateway = stop.during(opened).await?;
     let mut problems = gateway.discovery_problem();
     let mut problem = problems.borrow_and_update().clone();
     let mut reloads = gateway.reload_requests();

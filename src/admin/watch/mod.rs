@@ -20,23 +20,20 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::ErrorChain;
 use fipa_mts::watch::Joiner;
 use fipa_mts::watch::record::{MAX_CONTENT, Wish};
 pub use fipa_mts::watch::{Event, Fate, Passage, RecordError, SeenEnvelope};
-use fipa_sds::{Cancellation, Directory, HostDirectory, Reach};
-use fipa_transport::{Incarnation, log_limit};
+use fipa_sds::{Directory, Reach};
+use fipa_transport::Incarnation;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use self::listener::ProcessEvent;
 pub(crate) use self::watchers::Watchers;
 use crate::Config;
+use crate::admin::member::Member;
 use crate::domain::directory_view::DirectoryView;
-use crate::domain::files::DomainDir;
 use crate::domain::maintenance::DirMaintenance;
-use crate::domain::membership::{self, Membership};
-use crate::domain::process::Owner;
 use crate::error::OpenError;
 
 /// The options of a [`Watcher`].
@@ -50,11 +47,9 @@ pub struct WatchOptions {
 pub struct Watcher {
     events: mpsc::Receiver<ProcessEvent>,
     joiner: Joiner,
-    host: Arc<HostDirectory>,
-    dir: DomainDir,
-    owner: Owner,
     accepting: JoinHandle<()>,
     maintenance: JoinHandle<()>,
+    member: Member,
 }
 
 /// Maximum number of received batches of records that wait to be joined. Beyond it the watcher stops reading,
@@ -73,34 +68,24 @@ impl Watcher {
     /// # Errors
     /// If the configuration is invalid, or the directory of the domain cannot be used.
     pub async fn open(config: &Config, options: WatchOptions) -> Result<Self, OpenError> {
-        config.check()?;
-        tokio::runtime::Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
-        let name = format!("fipa-watch-{}", std::process::id());
-        let own = fipa_sds::MtsId::new(name, Incarnation::random());
-        let membership = Membership::default();
-        let (dir, host) = membership::join(config, &own, membership, &Cancellation::new())?;
-        let socket = host.listen().inspect_err(|_| leave(&host, &dir))?;
-        let socket = socket::listening(socket).map_err(|source| {
-            leave(&host, &dir);
-            OpenError::Watch(source)
-        })?;
+        let member = Member::join(config, "watch").await?;
+        let socket = member.host.listen()?;
+        let socket = socket::listening(socket).map_err(OpenError::Watch)?;
         let content = u32::try_from(options.content.min(MAX_CONTENT)).unwrap_or(u32::MAX);
         let (sender, events) = mpsc::channel(MAX_WAITING);
         let accepting = tokio::spawn(listener::run(
             socket,
-            host.users(),
+            member.host.users(),
             Wish { content },
             sender,
         ));
-        let maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host), None);
+        let maintenance = DirMaintenance::new(member.dir.clone(), Arc::clone(&member.host), None);
         let mut watcher = Self {
             events,
             joiner: Joiner::new(),
-            host,
             maintenance: tokio::spawn(maintenance.run()),
-            dir,
-            owner: Owner::this(),
             accepting,
+            member,
         };
         // A process that does not connect may be stopped; the others are watched in any case.
         let _ = tokio::time::timeout(CONNECT_TIMEOUT, watcher.all_connected()).await;
@@ -118,7 +103,7 @@ impl Watcher {
     }
 
     fn is_connected_to_all(&self) -> bool {
-        let entries = self.host.entries();
+        let entries = self.member.host.entries();
         let local = entries.iter().filter(|entry| entry.reach == Reach::Local);
         let connected: HashSet<Incarnation> = self.joiner.services().collect();
         local
@@ -187,33 +172,23 @@ impl Watcher {
     /// has discovered on other hosts.
     #[must_use]
     pub fn directory(&self) -> DirectoryView<'_> {
-        DirectoryView::of(&*self.host)
+        DirectoryView::of(&*self.member.host)
     }
 }
 
 impl fmt::Debug for Watcher {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Watcher")
-            .field("dir", &self.dir.path())
+            .field("dir", &self.member.dir.path())
             .finish_non_exhaustive()
     }
 }
 
 impl Drop for Watcher {
     fn drop(&mut self) {
-        // In a forked child, everything still belongs to the parent.
-        if !self.owner.is_this() {
-            return;
+        if self.member.is_own() {
+            self.accepting.abort();
+            self.maintenance.abort();
         }
-        self.accepting.abort();
-        self.maintenance.abort();
-        leave(&self.host, &self.dir);
     }
-}
-
-fn leave(host: &HostDirectory, dir: &DomainDir) {
-    if let Err(error) = host.close() {
-        log_limit::warn!(error = %ErrorChain(&error), "cannot remove this process from the directory of this host");
-    }
-    dir.leave();
 }

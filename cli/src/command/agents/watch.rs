@@ -25,7 +25,7 @@ pub(super) fn run(
     options::block_on(async {
         let mut stop = Stop::listen()?;
         let mut reader = output::Reader::of_output();
-        let domain = membership::join(config).await?;
+        let domain = stop.during(membership::join(config)).await?;
         let directory = domain.directory();
         // Watching starts before reading, so that an agent that joins in between is not missed.
         let mut changes = directory.watch();

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa::admin::watch::{Event, WatchOptions, Watcher};
+use fipa::admin::watch::{Event, WatchOptions};
 use fipa::error::ErrorChain;
 use fipa::locks::ResourceStatus;
 use fipa::monitor::Library;
@@ -167,8 +167,7 @@ async fn follow(
     let asker = Arc::new(register(domain, config).await?);
     let robots = Robots::default();
     let own = vec![status_asker.name().to_owned(), asker.name().to_owned()];
-    let watcher = Watcher::open(config, WatchOptions::default()).await;
-    let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
+    let mut watcher = membership::watch(config, WatchOptions::default()).await?;
     let mut observer = Observer::new(WINDOW, checker, own, config, &watcher);
     let (sender, mut reports) = mpsc::channel(1);
     let (locks_sender, mut locks) = mpsc::channel(1);

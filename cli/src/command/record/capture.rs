@@ -83,8 +83,9 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
     let mut stop = Stop::listen()?;
     let notes = arguments.supervised.then(notes).transpose()?;
     let content = arguments.content;
-    let watcher = Watcher::open(config, WatchOptions { content }).await;
-    let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
+    let mut watcher = stop
+        .during(membership::watch(config, WatchOptions { content }))
+        .await?;
     let mut recording = Recording {
         counts: Arc::default(),
         began: Instant::now(),

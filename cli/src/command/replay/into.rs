@@ -111,10 +111,10 @@ async fn replay(
     senders: &BTreeSet<String>,
 ) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
+    let domain = stop.during(membership::join(config)).await?;
     let mut tally = Tally::default();
     let sent = async {
-        let agents = register(&domain, senders, config).await?;
+        let agents = stop.during(register(&domain, senders, config)).await?;
         let mut stopped = pin!(stop.requested());
         tokio::select! {
             sent = send_all(arguments, &agents, config, &mut tally) => sent,

@@ -32,8 +32,8 @@ pub(super) async fn send(
     config: &Config,
 ) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
-    let agent = register(&domain, &arguments, config).await?;
+    let domain = stop.during(membership::join(config)).await?;
+    let agent = stop.during(register(&domain, &arguments, config)).await?;
     match located(&agent, &arguments).await {
         Ok(to) => arguments.to = to,
         Err(failure) => {

@@ -145,8 +145,8 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 
 async fn top(arguments: Arguments, checker: Checker, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
-    let domain = membership::join(config).await?;
-    let shown = match membership::asker(&domain).await {
+    let domain = stop.during(membership::join(config)).await?;
+    let shown = match stop.during(membership::asker(&domain)).await {
         Ok(asker) => show(arguments, checker, config, asker, &mut stop).await,
         Err(failure) => Err(failure),
     };
@@ -163,8 +163,9 @@ async fn show(
     asker: Agent,
     stop: &mut Stop,
 ) -> Result<(), Failure> {
-    let watcher = Watcher::open(config, WatchOptions::default()).await;
-    let watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
+    let watcher = stop
+        .during(membership::watch(config, WatchOptions::default()))
+        .await?;
     let (mut target, keys) = Target::open(&arguments)?;
     let window = match target {
         Target::Screen(..) => arguments.every.max(MIN_WINDOW),

@@ -165,8 +165,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 async fn watch(arguments: &Arguments, checker: Checker, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let content = arguments.content.unwrap_or(0);
-    let watcher = Watcher::open(config, WatchOptions { content }).await;
-    let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
+    let mut watcher = stop
+        .during(membership::watch(config, WatchOptions { content }))
+        .await?;
     let mut earlier = Earlier::default();
     earlier.add(watcher.directory());
     let mut display = Display {
