@@ -549,7 +549,7 @@ fn a_signal_ends_a_command_that_waits_for_the_directory() {
     lock.lock().unwrap();
     let commands = [
         vec!["agents", "--watch"],
-        vec!["coalition", "form", "pair", "arm"],
+        vec!["coalition", "pair", "arm"],
         vec!["echo", "crane"],
         vec!["listen", "crane"],
         vec!["locks", "--watch"],
@@ -567,7 +567,7 @@ fn a_signal_ends_a_command_that_waits_for_the_directory() {
         (arguments, ChildGuard::start(&mut command))
     });
     for (arguments, mut child) in waiting {
-        let pid = child.child().id();
+        let pid = child.id();
         until("the command handles signals", || {
             handles_interrupts(pid) || child.ended().is_some()
         });
