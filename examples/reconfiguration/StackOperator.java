@@ -21,6 +21,8 @@ import java.util.Iterator;
 import java.util.List;
 import java.util.Map;
 import java.util.UUID;
+import java.util.logging.Level;
+import java.util.logging.Logger;
 import java.util.regex.Matcher;
 import java.util.regex.Pattern;
 import java.util.stream.Collectors;
@@ -45,8 +47,9 @@ public class StackOperator extends Agent {
     /** Starts a platform of JADE with the operator, until standard input ends. The argument is the part as JSON. */
     public static void main(String[] arguments) throws Exception {
         StackOperator operator = new StackOperator(arguments[0]);
+        Logger.getLogger("").setLevel(Level.WARNING);
         ExtendedProperties options = new ExtendedProperties();
-        options.setProperty("name", "jade");
+        options.setProperty("platform-id", "jade");
         options.setProperty("local-host", "127.0.0.1");
         options.setProperty("local-port", freePort());
         String own = "http://127.0.0.1:" + freePort() + "/acc";

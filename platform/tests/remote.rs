@@ -38,6 +38,7 @@ impl Hosts {
             name: entry.name,
             source: 1,
             text: entry.text.unwrap(),
+            addresses: Vec::new(),
             ends: entry.lease.unwrap_or(now.at + limits::LEASE),
             has_lease: entry.lease.is_some(),
         });
@@ -51,6 +52,7 @@ fn remote(source: u64, name: &str, text: &str, clock: common::Clock) -> RemoteEn
         name: name.into(),
         source,
         text: text.into(),
+        addresses: Vec::new(),
         ends: clock.after(3600.0).at,
         has_lease: false,
     }

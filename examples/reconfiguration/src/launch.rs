@@ -390,8 +390,12 @@ impl Run<'_> {
 
     fn settings(&self, name: &str, role: Role, host: &str) -> Vec<String> {
         let protocol = self.path("dock.scxml");
-        let is_platform = role == Role::Gateway && self.serves_operator(host);
-        let transports = if is_platform { "shm,unix,tcp,http" } else { "shm,unix,tcp" };
+        let is_platform = role == Role::Gateway && self.options.operator.is_some();
+        let transports = if is_platform {
+            "shm,unix,tcp,http"
+        } else {
+            "shm,unix,tcp"
+        };
         let mut set = vec![
             format!("domain={}-{host}", self.name()),
             format!("mts.name={name}"),
@@ -462,15 +466,9 @@ impl Run<'_> {
         location.split('#').next()
     }
 
-    /// Whether an operator of another program is on this host.
-    fn serves_operator(&self, host: &str) -> bool {
-        let [_, (of_operator, _)] = HOSTS;
-        host == of_operator && self.options.operator.is_some()
-    }
-
     /// Returns the gateway of the host as a platform, if the part is that of an operator of another program.
     fn platform(&self, role: Role, host: &str) -> Option<Platform> {
-        let is_wanted = role == Role::Operator && self.serves_operator(host);
+        let is_wanted = role == Role::Operator && self.options.operator.is_some();
         let name = is_wanted.then(|| format!("{host}-mts"))?;
         let address = self.address(&name, "http:")?.to_owned();
         Some(Platform { name, address })
