@@ -13,6 +13,7 @@ import jade.domain.FIPANames.InteractionProtocol;
 import jade.lang.acl.ACLMessage;
 import jade.lang.acl.MessageTemplate;
 import jade.util.ExtendedProperties;
+import jade.wrapper.ContainerController;
 import java.io.IOException;
 import java.net.ServerSocket;
 import java.util.ArrayList;
@@ -55,9 +56,11 @@ public class StackOperator extends Agent {
         String own = "http://127.0.0.1:" + freePort() + "/acc";
         options.setProperty("mtps", "jade.mtp.http.MessageTransportProtocol(" + own + ")");
         options.setProperty("jade_core_messaging_MessageManager_enablemultipledelivery", "false");
-        Runtime.instance().createMainContainer(new ProfileImpl(options)).acceptNewAgent(operator.name, operator).start();
+        ContainerController container = Runtime.instance().createMainContainer(new ProfileImpl(options));
+        container.acceptNewAgent(operator.name, operator).start();
         while (System.in.read() >= 0) {}
-        System.exit(0);
+        // The platform has nothing to store.
+        java.lang.Runtime.getRuntime().halt(0);
     }
 
     @Override
