@@ -102,6 +102,7 @@ public class StackOperator extends Agent {
         send(look);
         receive(look, ACLMessage.INFORM);
     }
+    // ANCHOR_END: work
 
     private AID there(String agent) {
         // ISGUID: the name is used as it is, without the name of this platform.
@@ -198,7 +199,6 @@ public class StackOperator extends Agent {
             }
         }
     }
-    // ANCHOR_END: work
 
     private static double cost(ACLMessage proposal) {
         return Double.parseDouble(proposal.getContent());

@@ -326,7 +326,7 @@ impl Run<'_> {
 
     fn spawn(&mut self, name: &str, role: Role, host: &str) -> Result<(), Failed> {
         let part = Part {
-            platform: self.platform(role, host),
+            platform: self.platform(role, host)?,
             role,
             name: name.to_owned(),
             set: self.settings(name, role, host),
@@ -467,11 +467,14 @@ impl Run<'_> {
     }
 
     /// Returns the gateway of the host as a platform, if the part is that of an operator of another program.
-    fn platform(&self, role: Role, host: &str) -> Option<Platform> {
-        let is_wanted = role == Role::Operator && self.options.operator.is_some();
-        let name = is_wanted.then(|| format!("{host}-mts"))?;
-        let address = self.address(&name, "http:")?.to_owned();
-        Some(Platform { name, address })
+    fn platform(&self, role: Role, host: &str) -> Result<Option<Platform>, Failed> {
+        if role != Role::Operator || self.options.operator.is_none() {
+            return Ok(None);
+        }
+        let name = format!("{host}-mts");
+        let address = self.address(&name, "http:");
+        let address = address.ok_or("the gateway has no HTTP address")?.to_owned();
+        Ok(Some(Platform { name, address }))
     }
 
     /// Records a fault.

@@ -4,9 +4,10 @@
 #![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
 use std::io::{Read as _, Write as _};
 use std::net::{TcpListener, TcpStream};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread;
@@ -31,6 +32,8 @@ const GATEWAY: &str = "127.0.0.1:44839";
 /// The program that the launcher starts as the operator: it stores its part, and prints the claims of the test.
 const OPERATOR: &str = r#"printf %s "$1" > "$0/new"; mv "$0/new" "$0/part"; exec cat "$0/claims""#;
 
+/// Pause between two searches.
+const PAUSE: Duration = Duration::from_millis(100);
 const TIMEOUT: Duration = Duration::from_secs(60);
 
 #[tokio::test]
@@ -60,7 +63,8 @@ async fn the_operator_may_be_an_agent_of_jade() {
 
 /// A recorded run of the agent of JADE, which is repeated.
 struct Replay {
-    claims: PathBuf,
+    /// Its end ends the operator, also when the test fails.
+    claims: File,
     /// Pairs of an address in the recording, and the one in its place.
     addresses: Vec<(String, String)>,
     letters: Receiver<Message>,
@@ -77,6 +81,7 @@ impl Replay {
     /// Waits until the launcher has started the operator.
     fn new(dir: &Path) -> Self {
         let part = fipa_testbed::until_some("the part", || std::fs::read(dir.join("part")).ok());
+        let claims = File::options().write(true).open(dir.join("claims"));
         let part: Part = serde_json::from_slice(&part).unwrap();
         let platform = part.platform.unwrap();
         assert_eq!(platform.name, "crex-mts");
@@ -91,7 +96,7 @@ impl Replay {
             }
         });
         Self {
-            claims: dir.join("claims"),
+            claims: claims.unwrap(),
             addresses: vec![(JADE.to_owned(), here), (GATEWAY.to_owned(), gateway)],
             letters,
             early: Vec::new(),
@@ -103,31 +108,32 @@ impl Replay {
 
     /// Returns the number of answers.
     fn run(mut self) -> usize {
-        let mut claims = std::fs::OpenOptions::new()
-            .write(true)
-            .open(&self.claims)
-            .unwrap();
-        let mut answers = 0;
+        let (mut answers, mut last) = (0, (Vec::new(), String::new()));
         for request in jade::requests(RECORDING) {
             let message = read(request);
-            let to = &addresses(str::from_utf8(request.get(..60).unwrap()).unwrap())[0];
+            let to = &addresses(str::from_utf8(&request[..60]).unwrap())[0];
             if to == JADE {
                 answers += 1;
-                self.answer(&message);
+                // As in `StackOperator.java`, a search is repeated until it finds the agents.
+                while !self.answer(&message) {
+                    thread::sleep(PAUSE);
+                    jade::post(&last.0, &last.1);
+                }
                 continue;
             }
             let (_, to) = self.addresses.iter().find(|(from, _)| from == to).unwrap();
             let pairs = self.addresses.iter();
             let pairs: Vec<(&str, &str)> = pairs.map(|(from, to)| (&**from, &**to)).collect();
-            jade::post(&jade::readdressed(request, &pairs), to);
+            last = (jade::readdressed(request, &pairs), to.clone());
+            jade::post(&last.0, &last.1);
             if let Some(award) = self.sent(&message) {
-                claim(&mut claims, award);
+                claim(&self.claims, award);
             }
         }
         assert_eq!(self.early, []);
         assert!(self.letters.try_recv().is_err());
         let (stack, reason) = (self.stack, None);
-        claim(&mut claims, Claim::Finished { stack, reason });
+        claim(&self.claims, Claim::Finished { stack, reason });
         answers
     }
 
@@ -159,8 +165,8 @@ impl Replay {
         None
     }
 
-    /// Waits for this answer of the recording.
-    fn answer(&mut self, recorded: &Message) {
+    /// Waits for this answer of the recording. Returns whether it has as many agents, if it is that of a search.
+    fn answer(&mut self, recorded: &Message) -> bool {
         let key = |it: &Message| {
             let sender = it.sender().unwrap().name().to_owned();
             let conversation = it.conversation_id().unwrap().to_owned();
@@ -184,6 +190,9 @@ impl Replay {
         assert_eq!(answer.receivers()[0].name(), "operator@jade");
         // The directory facilitator tells where the gateways of the found agents take letters.
         let (then, now) = (addresses(&recorded.text()), addresses(&answer.text()));
+        if answer.sender().unwrap().name() == "df@crex-mts" && then.len() != now.len() {
+            return false;
+        }
         assert_eq!(then.len(), now.len(), "{answer:?}");
         self.addresses.extend(then.into_iter().zip(now));
         let (conversation, robot, act) = key(&answer);
@@ -201,6 +210,7 @@ impl Replay {
             }
             _ => {}
         }
+        true
     }
 }
 
@@ -240,7 +250,7 @@ fn receive(mut stream: TcpStream, sender: &Sender<Message>) {
 }
 
 /// Reports to the launcher.
-fn claim(claims: &mut std::fs::File, claim: Claim) {
+fn claim(mut claims: &File, claim: Claim) {
     let at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
     let report = Report {
         at: u64::try_from(at.as_micros()).unwrap(),

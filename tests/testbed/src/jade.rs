@@ -13,17 +13,14 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 /// If the bytes are no request.
 #[must_use]
 pub fn readdressed(request: &[u8], addresses: &[(&str, &str)]) -> Vec<u8> {
-    let mut bytes = request.to_vec();
-    for (from, to) in addresses {
-        bytes = replaced(&bytes, from, to);
-    }
+    let bytes = replaced(request, addresses);
     let head = position(&bytes, b"\r\n\r\n").expect("a head") + 4;
     let length = content_length(&bytes[..head]);
     // JADE writes two bytes behind the body.
     let uncounted = if bytes.ends_with(b"\r\n\r\n") { 2 } else { 0 };
     let now = bytes.len() - head - uncounted;
     let field = |length: usize| format!("Content-Length: {length}\r\n");
-    replaced(&bytes, &field(length), &field(now))
+    replaced(&bytes, &[(&field(length), &field(now))])
 }
 
 /// Splits the bytes of several requests.
@@ -89,13 +86,23 @@ fn position(bytes: &[u8], what: &[u8]) -> Option<usize> {
     bytes.windows(what.len()).position(|it| it == what)
 }
 
-fn replaced(bytes: &[u8], from: &str, to: &str) -> Vec<u8> {
-    let (from, mut rest, mut out) = (from.as_bytes(), bytes, Vec::new());
-    while let Some(at) = position(rest, from) {
-        out.extend(&rest[..at]);
-        out.extend(to.as_bytes());
-        rest = &rest[at + from.len()..];
+/// Replaces each text in the first place of a pair, and nothing in the texts that take its place.
+fn replaced(mut bytes: &[u8], pairs: &[(&str, &str)]) -> Vec<u8> {
+    let mut out = Vec::new();
+    while let [first, rest @ ..] = bytes {
+        match pairs
+            .iter()
+            .find(|(from, _)| bytes.starts_with(from.as_bytes()))
+        {
+            Some((from, to)) => {
+                out.extend(to.as_bytes());
+                bytes = &bytes[from.len()..];
+            }
+            None => {
+                out.push(*first);
+                bytes = rest;
+            }
+        }
     }
-    out.extend(rest);
     out
 }
