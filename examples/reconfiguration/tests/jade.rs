@@ -56,7 +56,7 @@ async fn the_operator_may_be_an_agent_of_jade() {
     let answers = replay.join().unwrap();
     let outcome = outcome.unwrap();
     assert!(outcome.failed.is_empty(), "{:?}", outcome.failed);
-    assert_eq!(answers, 15);
+    assert_eq!(answers, 14);
     let docked = |report: &&Report| matches!(report.claim, Claim::Docked { .. });
     assert_eq!(outcome.reports.iter().filter(docked).count(), 2);
 }
