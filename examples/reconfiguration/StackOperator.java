@@ -184,18 +184,20 @@ public class StackOperator extends Agent {
 
     /** Waits for an answer with this performative. Each other one but `agree` is a failure. */
     private ACLMessage receive(ACLMessage asked, int performative) throws FIPAException {
+        MessageTemplate of = MessageTemplate.MatchConversationId(asked.getConversationId());
         while (true) {
-            ACLMessage answer = blockingReceive(MessageTemplate.MatchConversationId(asked.getConversationId()), TIMEOUT);
+            ACLMessage answer = blockingReceive(of, TIMEOUT);
             if (answer == null) {
                 throw new FIPAException("no answer to the " + ACLMessage.getPerformative(asked.getPerformative()));
             }
-            String shown = ACLMessage.getPerformative(answer.getPerformative()) + " of " + answer.getSender().getName();
-            System.err.println(shown + ": " + answer.getContent());
+            String shown = ACLMessage.getPerformative(answer.getPerformative()) + " of " + answer.getSender().getName()
+                    + ": " + answer.getContent();
+            System.err.println(quoted(shown));
             if (answer.getPerformative() == performative) {
                 return answer;
             }
             if (answer.getPerformative() != ACLMessage.AGREE) {
-                throw new FIPAException(shown + ": " + answer.getContent());
+                throw new FIPAException(shown);
             }
         }
     }
@@ -230,10 +232,7 @@ public class StackOperator extends Agent {
     }
 
     private static String quoted(String text) {
-        StringBuilder quoted = new StringBuilder("\"");
-        text.chars().forEach(it -> quoted.append(String.format(it < ' ' || it > '~' || it == '"' || it == '\\'
-                ? "\\u%04x" : "%c", it)));
-        return quoted + "\"";
+        return "\"" + text.replace("\\", "\\\\").replace("\"", "\\\"").replaceAll("\\p{Cntrl}", " ") + "\"";
     }
 
     /** Returns the first text of the field with this name. */
