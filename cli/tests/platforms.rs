@@ -5,13 +5,14 @@
 
 mod common;
 
-use std::io::{Read, Write};
-use std::net::{TcpListener, TcpStream};
+use std::io::{Read as _, Write as _};
+use std::net::TcpListener;
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use common::{Host, Running};
 use fipa::{Message, Performative};
+use fipa_testbed::jade::{self, post, readdressed as at};
 use serde_json::{Value, json};
 
 macro_rules! recorded {
@@ -49,44 +50,6 @@ const RECORDED_AT: &str = "127.0.0.1:27778";
 
 const TIMEOUT: Duration = Duration::from_secs(60);
 
-fn replaced(bytes: &[u8], from: &str, to: &str) -> Vec<u8> {
-    let (from, mut rest, mut out) = (from.as_bytes(), bytes, Vec::new());
-    while let Some(at) = rest.windows(from.len()).position(|it| it == from) {
-        out.extend(&rest[..at]);
-        out.extend(to.as_bytes());
-        rest = &rest[at + from.len()..];
-    }
-    out.extend(rest);
-    out
-}
-
-/// Returns a recorded request with the addresses of this test instead of those of the recording.
-fn at(request: &[u8], addresses: &[(&str, &str)]) -> Vec<u8> {
-    let mut bytes = request.to_vec();
-    for (from, to) in addresses {
-        bytes = replaced(&bytes, from, to);
-    }
-    let head = bytes.windows(4).position(|it| it == b"\r\n\r\n").unwrap() + 4;
-    let text = String::from_utf8(bytes[..head].to_vec()).unwrap();
-    let (_, length) = text.split_once("Content-Length: ").unwrap();
-    let length = length.lines().next().unwrap();
-    // JADE writes two bytes behind the body.
-    let uncounted = if bytes.ends_with(b"\r\n\r\n") { 2 } else { 0 };
-    let now = (bytes.len() - head - uncounted).to_string();
-    let field = |length: &str| format!("Content-Length: {length}\r\n");
-    replaced(&bytes, &field(length), &field(&now))
-}
-
-/// Sends a request as JADE does, and checks the answer.
-fn post(request: &[u8], to: &str) {
-    let mut stream = TcpStream::connect(to).unwrap();
-    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
-    stream.write_all(request).unwrap();
-    let mut answer = [0; 15];
-    stream.read_exact(&mut answer).unwrap();
-    assert_eq!(&answer, b"HTTP/1.1 200 OK");
-}
-
 /// Reads a request, answers it as JADE does, and returns its message.
 fn accept(listener: &TcpListener) -> Message {
     listener.set_nonblocking(true).unwrap();
@@ -102,26 +65,20 @@ fn accept(listener: &TcpListener) -> Message {
     stream.set_read_timeout(Some(TIMEOUT)).unwrap();
     let mut bytes = Vec::new();
     let mut more = [0; 65536];
-    let body = loop {
+    loop {
         let len = stream.read(&mut more).unwrap();
         assert!(len > 0, "the request is not complete");
         bytes.extend(&more[..len]);
         let Some(head) = bytes.windows(4).position(|it| it == b"\r\n\r\n") else {
             continue;
         };
-        let text = String::from_utf8(bytes[..head].to_vec()).unwrap();
-        let (_, length) = text.split_once("Content-Length: ").unwrap();
-        let length: usize = length.lines().next().unwrap().parse().unwrap();
-        if bytes.len() == head + 4 + length {
-            break String::from_utf8(bytes[head..].to_vec()).unwrap();
+        if bytes.len() == head + 4 + jade::content_length(&bytes[..head]) {
+            break;
         }
-    };
+    }
     stream.write_all(ANSWER).unwrap();
-    let payload = body.split("\r\n\r\n").nth(3).unwrap();
-    let (payload, _) = payload.rsplit_once("\r\n--").unwrap();
-    let payload = payload.to_owned().into_bytes();
     let payload = fipa_acl::Payload {
-        head: payload.into(),
+        head: jade::message(&bytes).to_vec().into(),
         ..fipa_acl::Payload::default()
     };
     Message::decode(&payload).unwrap()

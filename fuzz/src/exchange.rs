@@ -49,6 +49,7 @@ fn df(agent: &Entry) -> OwnDfEntry {
         name: Arc::clone(&agent.name),
         incarnation: agent.incarnation,
         text: Arc::clone(&agent.name),
+        addresses: vec!["http://10.0.0.1:7778/acc".to_owned()],
         lease: None,
     }
 }

@@ -113,6 +113,7 @@ fn remote(input: &mut Input<'_>, now: PlatformTime) -> Vec<RemoteEntry> {
             name: name.into(),
             source: u64::from(input.byte() % 3),
             text: String::from_utf8_lossy(&text).into(),
+            addresses: vec![String::from_utf8_lossy(input.bytes(40)).into()],
             ends: now.at + input.time().min(Duration::from_secs(3600)),
             has_lease: input.below(2) == 0,
         }

@@ -102,25 +102,48 @@ impl Entry {
 
     /// Returns the description for an asker whose platform reaches the agents of this host at these addresses.
     fn located(&self, addresses: &[String]) -> Cow<'_, AgentDescription> {
-        let description = Cow::Borrowed(&self.description);
-        match &self.description.name {
-            Some(name) if self.platform == Platform::Host && !addresses.is_empty() => {
-                Cow::Owned(AgentDescription {
-                    name: Some(located(name.clone(), addresses)),
-                    ..description.into_owned()
-                })
-            }
-            _ => description,
+        match self.platform {
+            Platform::Host => with_addresses(&self.description, addresses),
+            _ => Cow::Borrowed(&self.description),
         }
+    }
+}
+
+/// Adds addresses to the agent of a description.
+fn with_addresses<'a>(
+    description: &'a AgentDescription,
+    addresses: &[String],
+) -> Cow<'a, AgentDescription> {
+    match &description.name {
+        Some(name) if !addresses.is_empty() => Cow::Owned(AgentDescription {
+            name: Some(located(name.clone(), addresses)),
+            ..description.clone()
+        }),
+        _ => Cow::Borrowed(description),
     }
 }
 
 struct Remote {
     source: u64,
     text: Arc<str>,
+    addresses: Vec<String>,
     /// `None` if the text is not valid.
     description: Option<AgentDescription>,
     ends: Instant,
+}
+
+impl Remote {
+    /// Returns the description, if it is valid, for an asker whose platform reaches the agents of this host at these
+    /// addresses: with those of the agent that have the same transports.
+    fn located(&self, addresses: &[String]) -> Option<Cow<'_, AgentDescription>> {
+        fn transport(address: &str) -> Option<&str> {
+            address.split_once("://").map(|(name, _)| name)
+        }
+        let own: Vec<&str> = addresses.iter().filter_map(|it| transport(it)).collect();
+        let is_same = |it: &&String| transport(it).is_some_and(|it| own.contains(&it));
+        let same: Vec<String> = self.addresses.iter().filter(is_same).cloned().collect();
+        Some(with_addresses(self.description.as_ref()?, &same))
+    }
 }
 
 const DESCRIPTION: &str = "df-agent-description";
@@ -148,7 +171,7 @@ impl Df {
         }
     }
 
-    /// Adds addresses to the agents of this host in answers.
+    /// Adds addresses to the agents of this host in answers, and those of agents of other hosts.
     #[must_use]
     pub fn with_addresses(self, addresses: AddressBook) -> Self {
         Self {
@@ -225,6 +248,11 @@ impl Df {
         Some(entries.collect())
     }
 
+    /// Makes [`poll_local`](Self::poll_local) return the descriptions, because the addresses of the agents have changed.
+    pub fn handle_relocation(&mut self) {
+        self.is_local_changed = true;
+    }
+
     /// Sets the descriptions from the directory facilitators of other hosts. Those that are missing end
     /// at once. Returns whether a host has sent more than [`limits::REMOTE_CHANGES`] new descriptions:
     /// the caller then calls again after [`limits::REMOTE_PAUSE`], and never earlier.
@@ -248,6 +276,7 @@ impl Df {
             if let Some(known) = self.remote.get_mut(&entry.name)
                 && known.text == entry.text
             {
+                known.addresses.clone_from(&entry.addresses);
                 if known.ends != entry.ends {
                     let name = &entry.name;
                     self.remote_ends.remove(&(known.ends, Arc::clone(name)));
@@ -270,6 +299,7 @@ impl Df {
                 let remote = Remote {
                     source: entry.source,
                     text: Arc::clone(&entry.text),
+                    addresses: entry.addresses.clone(),
                     description: remote::read(now, entry),
                     ends: entry.ends,
                 };
@@ -628,9 +658,9 @@ impl Df {
 
     /// Returns the descriptions from other hosts that match. Those of the hosts take turns, so that no
     /// host fills an answer that is cut.
-    fn remote_matches(&self, template: &AgentDescription) -> Vec<&AgentDescription> {
+    fn remote_matches(&self, template: &AgentDescription) -> Vec<&Remote> {
         let mut of_source: HashMap<u64, usize> = HashMap::new();
-        let mut matches: Vec<(usize, &AgentDescription)> = Vec::new();
+        let mut matches: Vec<(usize, &Remote)> = Vec::new();
         for (name, remote) in &self.remote {
             let Some(description) = &remote.description else {
                 continue;
@@ -639,7 +669,7 @@ impl Df {
             let found = Comparisons::default().agent(template, description);
             if found.unwrap_or(false) && !self.entries.contains_key(name) {
                 let turn = of_source.entry(remote.source).or_default();
-                matches.push((*turn, description));
+                matches.push((*turn, remote));
                 *turn += 1;
             }
         }
@@ -688,8 +718,9 @@ impl Df {
             }
         }
         if found.texts.len() < most {
-            for description in self.remote_matches(template) {
-                if found.texts.len() >= most || !found.add(description, dialect) {
+            let remote = self.remote_matches(template).into_iter();
+            for description in remote.filter_map(|it| it.located(&addresses)) {
+                if found.texts.len() >= most || !found.add(&description, dialect) {
                     break;
                 }
             }
@@ -872,10 +903,7 @@ impl Df {
                 let dialect = subscription.dialect();
                 let own = self.entries.get(&name);
                 let own = own.map(|entry| entry.located(&addresses));
-                let remote = || {
-                    let remote = self.remote.get(&name)?.description.as_ref();
-                    remote.map(Cow::Borrowed)
-                };
+                let remote = || self.remote.get(&name)?.located(&addresses);
                 let has_room = match own.or_else(remote) {
                     Some(description) => found.add(&description, dialect),
                     // A description without services reports the end of the registration, as in JADE.

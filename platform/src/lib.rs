@@ -191,7 +191,8 @@ pub enum Platform {
 }
 
 /// Returns the addresses under which the platform of an asker, with this identifier, reaches the agents of this host;
-/// empty if it needs none. Answers have them in the identifiers of agents of this host without addresses.
+/// empty if it needs none. Answers have them in the identifiers of agents of this host without addresses; those of agents
+/// of other hosts have the addresses of the same transports there.
 pub type AddressBook = Arc<dyn Fn(&AgentId) -> Vec<String> + Send + Sync>;
 
 /// Returns the addresses under which the platform of an asker reaches the agents of this host.

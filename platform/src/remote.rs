@@ -41,6 +41,8 @@ pub struct RemoteEntry {
     pub source: u64,
     /// The description; see [`LocalEntry::text`].
     pub text: Arc<str>,
+    /// The addresses at which agents of other platforms reach the agent.
+    pub addresses: Vec<String>,
     /// The time at which the description ends.
     pub ends: Instant,
     /// Whether it ends because of a lease, which searches show.

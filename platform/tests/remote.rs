@@ -8,10 +8,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use common::{Facilitator, OTHER, all_lifting, asker, id, lifting, local, message, names};
-use fipa_acl::{Performative, Time};
+use fipa_acl::{AgentId, Performative, Time};
 use fipa_platform::{
-    AgentDescription, Constraints, Exception, Function, LocalEntry, Property, RemoteEntry,
-    ServiceDescription, found, limits, notified, subscription,
+    AgentDescription, Asker, Constraints, Df, Exception, Function, LocalEntry, Platform, Property,
+    RemoteEntry, ServiceDescription, found, limits, notified, subscription,
 };
 
 /// Two facilitators, and what the exchange carries between them.
@@ -38,6 +38,7 @@ impl Hosts {
             name: entry.name,
             source: 1,
             text: entry.text.unwrap(),
+            addresses: Vec::new(),
             ends: entry.lease.unwrap_or(now.at + limits::LEASE),
             has_lease: entry.lease.is_some(),
         });
@@ -51,6 +52,7 @@ fn remote(source: u64, name: &str, text: &str, clock: common::Clock) -> RemoteEn
         name: name.into(),
         source,
         text: text.into(),
+        addresses: Vec::new(),
         ends: clock.after(3600.0).at,
         has_lease: false,
     }
@@ -162,6 +164,46 @@ fn descriptions_of_agents_of_this_host_travel_in_the_order_of_their_registration
         assert_eq!(all[2].text, None);
         assert!(all[1].text.is_some());
     }
+}
+
+#[test]
+fn an_asker_of_another_platform_gets_the_addresses_of_its_transport() {
+    let mut far = Facilitator::new();
+    let here = "http://10.0.0.1:7778/acc".to_owned();
+    let at_home = here.clone();
+    far.df = Df::new(id("df@mts")).with_addresses(Arc::new(move |_| vec![at_home.clone()]));
+    far.register(&local("arm")).unwrap();
+    let crane = |addresses: &[&str]| RemoteEntry {
+        addresses: addresses.iter().map(|&it| it.to_owned()).collect(),
+        ..of(1, &lifting("crane"), far.clock)
+    };
+    let addresses = |it: &mut Facilitator, asker: &Asker| -> Vec<Vec<String>> {
+        let search = Function::search(&all_lifting(), &Constraints::all());
+        let answer = it.call(0.0, asker, &search).unwrap();
+        let found = found(&answer).unwrap();
+        let names = found.iter().filter_map(|it| it.name.as_ref());
+        let of = |id: &AgentId| id.addresses().iter().map(ToString::to_string).collect();
+        names.map(of).collect()
+    };
+    let first = ["https://10.0.0.2/acc", "http://10.0.0.2:7778/acc", "http:"];
+    let (first, moved) = (crane(&first), crane(&["http://10.0.0.3:7778/acc"]));
+    let now = far.clock.after(0.0);
+    far.df.handle_remote(now, &[first]);
+    let jade = asker("jade", Platform::Unproved);
+    let there = "http://10.0.0.2:7778/acc".to_owned();
+    assert_eq!(
+        addresses(&mut far, &jade),
+        [vec![here.clone()], vec![there]]
+    );
+    // The description is the same.
+    far.df.handle_remote(now, &[moved]);
+    let there = "http://10.0.0.3:7778/acc".to_owned();
+    assert_eq!(addresses(&mut far, &jade), [vec![here], vec![there]]);
+    // Agents of this host need none.
+    assert_eq!(
+        addresses(&mut far, &local("rover")),
+        [vec![], Vec::<String>::new()]
+    );
 }
 
 #[test]

@@ -145,6 +145,7 @@ impl World {
             name: name.into(),
             incarnation: gateway.agents[name].incarnation,
             text: text.into(),
+            addresses: Vec::new(),
             lease: lease.map(|time_left| self.now + time_left),
         };
         gateway.df.insert(name.to_owned(), entry);

@@ -201,10 +201,38 @@ impl PlatformAgents {
                     _ => entry.gateway.as_u64(),
                 },
                 text: Arc::clone(&entry.text),
+                addresses: self.addresses_of(&entry),
                 ends: entry.ends,
                 has_lease: entry.has_lease,
             })
             .collect()
+    }
+
+    /// Returns the addresses at which agents of other platforms reach the agents of this host.
+    fn addresses(&self) -> Vec<String> {
+        let all = self.service.shown_locations().into_iter();
+        let http = all.filter(is_http);
+        let addresses = http.map(|it| format!("{}://{}", it.kind(), it.address()));
+        let fitting = addresses.filter(|it| it.len() <= Exchange::MAX_DF_ADDRESS);
+        fitting.take(Exchange::MAX_DF_ADDRESSES).collect()
+    }
+
+    /// Returns the addresses at which agents of other platforms reach an agent of another host. Loopback addresses count
+    /// if the gateway of the agent is on this machine.
+    fn addresses_of(&self, entry: &DfEntry) -> Vec<String> {
+        let is_loopback = |location: &Location| match Endpoint::of(location) {
+            Some(Endpoint::Numeric(at)) => at.ip().to_canonical().is_loopback(),
+            _ => false,
+        };
+        let holder = self.known.known(&entry.name);
+        let is_near = holder.is_some_and(|it| it.locations.iter().any(is_loopback));
+        let is_valid = |address: &&String| {
+            let location = address.parse::<Location>().ok();
+            let location = location.filter(is_http);
+            location.is_some_and(|it| is_near || !is_loopback(&it))
+        };
+        let valid = entry.addresses.iter().filter(is_valid);
+        valid.cloned().collect()
     }
 
     /// Sends the entries of the directory facilitator to other gateways. Returns the agents whose
@@ -219,11 +247,13 @@ impl PlatformAgents {
             .filter(|entry| entry.text.is_none())
             .map(|entry| Arc::clone(&entry.name))
             .collect();
+        let addresses = self.addresses();
         let entries = local.into_iter().filter_map(|entry| {
             Some(OwnDfEntry {
                 name: entry.name,
                 incarnation: Incarnation::from_u64(entry.registration),
                 text: entry.text?,
+                addresses: addresses.clone(),
                 lease: entry.lease,
             })
         });
@@ -650,8 +680,9 @@ impl Task {
                 log_limit::warn!(error = %ErrorChain(&error), agent = one.name(), "cannot update an agent of the gateway");
             }
         }
-        if let Core::Ams(ams) = &mut self.core {
-            ams.describe(means.description());
+        match &mut self.core {
+            Core::Ams(ams) => ams.describe(means.description()),
+            Core::Df(df) => df.handle_relocation(),
         }
     }
 
@@ -733,6 +764,12 @@ fn reached_at(own: &[Location], platform: &Location) -> Vec<String> {
             all.take(MAX_ADDRESSES).collect()
         }
     }
+}
+
+/// Whether agents of other platforms send letters to this location.
+fn is_http(location: &Location) -> bool {
+    use fipa_transport::Kind;
+    matches!(location.kind(), Kind::Http | Kind::Https)
 }
 
 /// Returns the address of this host in packets to another one. Nothing is sent.

@@ -15,7 +15,7 @@ use tokio::process::{Child, ChildStdin, Command};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, timeout_at};
 
-use crate::part::{Failed, Mutant, Part, Role, Stop};
+use crate::part::{Failed, Mutant, Part, Platform, Role, Stop};
 pub use crate::relay::Link;
 use crate::relay::Relay;
 use crate::report::{Claim, Report, now};
@@ -165,7 +165,8 @@ impl Run<'_> {
         self.start(&gateway(here), Role::Gateway, here, show)
             .await?;
         let behind = self
-            .tcp_address(&gateway(here))
+            .address(&gateway(here), "tcp:")
+            .and_then(|it| it.strip_prefix("tcp://")?.parse().ok())
             .ok_or("the gateway has no TCP address")?;
         self.relay = Some(Relay::start(behind, self.options.link).await?);
         self.start(&gateway(there), Role::Gateway, there, show)
@@ -325,6 +326,7 @@ impl Run<'_> {
 
     fn spawn(&mut self, name: &str, role: Role, host: &str) -> Result<(), Failed> {
         let part = Part {
+            platform: self.platform(role, host)?,
             role,
             name: name.to_owned(),
             set: self.settings(name, role, host),
@@ -341,6 +343,7 @@ impl Run<'_> {
         };
         let program = own.unwrap_or(&self.options.program);
         let (program, arguments) = program.split_first().ok_or("no program")?;
+        let failed = |error| format!("cannot start {}: {error}", program.display());
         let mut child = Command::new(program)
             .args(arguments)
             .arg(serde_json::to_string(&part)?)
@@ -352,18 +355,32 @@ impl Run<'_> {
             // Ctrl-C is sent to the launcher only, which ends its processes in order.
             .process_group(0)
             .kill_on_drop(true)
-            .spawn()?;
+            .spawn()
+            .map_err(failed)?;
         let orders = child.stdin.take();
         let output = child.stdout.take().ok_or("no standard output")?;
         let sender = self.sender.clone();
+        let by = name.to_owned();
         tokio::spawn(async move {
             let mut lines = BufReader::new(output).lines();
+            // A run ends with the report of the operator, so it cannot go on without one.
+            let mut is_awaited = role == Role::Operator;
             while let Ok(Some(line)) = lines.next_line().await {
-                if let Ok(report) = serde_json::from_str(&line)
-                    && sender.send(report).is_err()
-                {
+                let Ok(report) = serde_json::from_str::<Report>(&line) else {
+                    continue;
+                };
+                let ends = matches!(report.claim, Claim::Finished { .. } | Claim::Broken { .. });
+                is_awaited &= !ends;
+                if sender.send(report).is_err() {
                     return;
                 }
+            }
+            if is_awaited {
+                let error = "the program has ended without the claim `finished`".to_owned();
+                let claim = Claim::Broken { error };
+                let at = now();
+                // The run may have ended.
+                let _ = sender.send(Report { at, by, claim });
             }
         });
         self.processes
@@ -373,12 +390,18 @@ impl Run<'_> {
 
     fn settings(&self, name: &str, role: Role, host: &str) -> Vec<String> {
         let protocol = self.path("dock.scxml");
+        let is_platform = role == Role::Gateway && self.options.operator.is_some();
+        let transports = if is_platform {
+            "shm,unix,tcp,http"
+        } else {
+            "shm,unix,tcp"
+        };
         let mut set = vec![
             format!("domain={}-{host}", self.name()),
             format!("mts.name={name}"),
             // No traffic leaves this machine, and the domains meet no others.
             "discovery.mdns=false".to_owned(),
-            "mts.transports=shm,unix,tcp".to_owned(),
+            format!("mts.transports={transports}"),
             // Letters outlive a cut of the link.
             "mts.deadline=20s".to_owned(),
             format!("monitor.protocols=[{:?}]", protocol.display().to_string()),
@@ -397,6 +420,9 @@ impl Run<'_> {
                 set.push("transport.tcp.listen=[]".to_owned());
             }
             None => set.push("transport.tcp.listen=127.0.0.1:0".to_owned()),
+        }
+        if is_platform {
+            set.push("transport.http.listen=127.0.0.1:0".to_owned());
         }
         if role == Role::Gateway && host == HOSTS[0].0 && self.options.dashboard {
             set.push("http.listen=127.0.0.1:0".to_owned());
@@ -430,13 +456,25 @@ impl Run<'_> {
         self.dir.path().join(file)
     }
 
-    fn tcp_address(&self, gateway: &str) -> Option<std::net::SocketAddr> {
+    /// Returns where a gateway listens with this transport, for example `http://127.0.0.1:7778/acc`.
+    fn address(&self, gateway: &str, transport: &str) -> Option<&str> {
         let locations = self.all.iter().find_map(|report| match &report.claim {
             Claim::Listening { locations } if report.by == gateway => Some(locations),
             _ => None,
         })?;
-        let tcp = locations.iter().find_map(|it| it.strip_prefix("tcp://"))?;
-        tcp.split('#').next()?.parse().ok()
+        let location = locations.iter().find(|it| it.starts_with(transport))?;
+        location.split('#').next()
+    }
+
+    /// Returns the gateway of the host as a platform, if the part is that of an operator of another program.
+    fn platform(&self, role: Role, host: &str) -> Result<Option<Platform>, Failed> {
+        if role != Role::Operator || self.options.operator.is_none() {
+            return Ok(None);
+        }
+        let name = format!("{host}-mts");
+        let address = self.address(&name, "http:");
+        let address = address.ok_or("the gateway has no HTTP address")?.to_owned();
+        Ok(Some(Platform { name, address }))
     }
 
     /// Records a fault.

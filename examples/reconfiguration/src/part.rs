@@ -74,6 +74,18 @@ pub struct Part {
     pub fault: Option<crate::Fault>,
     /// The defect of this process.
     pub mutant: Option<Mutant>,
+    /// The gateway of its host, for an operator that is an agent of another platform.
+    pub platform: Option<Platform>,
+}
+
+/// A gateway as another platform uses it: with letters over HTTP.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[expect(clippy::exhaustive_structs, reason = "the launcher writes each field")]
+pub struct Platform {
+    /// The name of the platform. Its directory facilitator is `df@NAME`.
+    pub name: String,
+    /// The address at which it takes letters.
+    pub address: String,
 }
 
 impl Part {

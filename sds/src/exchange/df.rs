@@ -23,6 +23,8 @@ pub struct OwnDfEntry {
     pub incarnation: Incarnation,
     /// The description of the agent in FIPA-SL, without its lease.
     pub text: Arc<str>,
+    /// The addresses at which agents of other platforms reach the agent.
+    pub addresses: Vec<String>,
     /// The end of the lease; `None` for an entry that ends with its agent only.
     pub lease: Option<Instant>,
 }
@@ -41,6 +43,8 @@ pub struct DfEntry {
     pub principal: Principal,
     /// The description of the agent, as its gateway sent it. It may be malformed.
     pub text: Arc<str>,
+    /// The addresses at which agents of other platforms reach the agent, as its gateway sent them. They may be malformed.
+    pub addresses: Vec<String>,
     /// Whether the entry has a lease, which ends at `ends` or later.
     pub has_lease: bool,
     /// The time at which the entry ends unless the gateway sends it again.
@@ -64,24 +68,40 @@ impl OwnDfEntry {
         };
         Some(wire::DfEntry {
             entry: self.text.to_string(),
+            addresses: self.addresses.clone(),
             lease: time_left.map(millis),
         })
     }
 
-    /// Maximum length of the text in a letter, in which some characters are escaped.
+    /// Maximum length of the entry in a letter, in which some characters are escaped.
     pub(super) fn weight(&self) -> usize {
         let escaped = |byte| match byte {
             b'"' | b'\\' => 2,
             0..=0x1f => 6,
             _ => 1,
         };
-        self.text.bytes().map(escaped).sum::<usize>() + 50
+        let weight = |text: &str| text.bytes().map(escaped).sum::<usize>();
+        let addresses = self.addresses.iter().map(|it| weight(it) + 3);
+        weight(&self.text) + addresses.sum::<usize>() + 70
+    }
+
+    fn bytes(&self) -> usize {
+        bytes(&self.text, &self.addresses)
     }
 }
 
+/// Returns the bytes of an entry that count.
+fn bytes(text: &str, addresses: &[String]) -> usize {
+    text.len() + addresses.iter().map(String::len).sum::<usize>()
+}
+
 impl DfEntry {
+    fn bytes(&self) -> usize {
+        bytes(&self.text, &self.addresses)
+    }
+
     /// Reads an entry of a letter that arrived now from this gateway. Returns `None` if the entry is
-    /// too long or its lease has ended.
+    /// too long or its lease has ended. Addresses beyond the bounds are left out.
     pub(super) fn read(
         now: Instant,
         (gateway, principal): (Incarnation, Principal),
@@ -103,6 +123,15 @@ impl DfEntry {
             gateway,
             principal,
             text: received.entry.into(),
+            addresses: match received.addresses.len() <= Exchange::MAX_DF_ADDRESSES
+                && received
+                    .addresses
+                    .iter()
+                    .all(|it| it.len() <= Exchange::MAX_DF_ADDRESS)
+            {
+                true => received.addresses,
+                false => Vec::new(),
+            },
             has_lease: time_left.is_some(),
             ends: now + lease,
         }))
@@ -114,7 +143,7 @@ impl DfEntry {
 pub(super) fn bounded(entries: Vec<OwnDfEntry>) -> (BTreeMap<Arc<str>, OwnDfEntry>, Vec<Arc<str>>) {
     let (mut admitted, mut others, mut used) = (BTreeMap::new(), Vec::new(), Use::default());
     for entry in entries {
-        let with = used.with(entry.text.len());
+        let with = used.with(entry.bytes());
         if entry.text.len() <= Exchange::MAX_DF_ENTRY && with.is_within(Use::OF_GATEWAY) {
             used = with;
             admitted.insert(Arc::clone(&entry.name), entry);
@@ -125,7 +154,7 @@ pub(super) fn bounded(entries: Vec<OwnDfEntry>) -> (BTreeMap<Arc<str>, OwnDfEntr
     (admitted, others)
 }
 
-/// A number of entries, and the bytes of their texts.
+/// A number of entries, and the bytes of their texts and addresses.
 #[derive(Debug, Clone, Copy, Default)]
 struct Use {
     entries: usize,
@@ -234,13 +263,13 @@ impl ReceivedDf {
         let (mut any, mut refused) = (false, 0_usize);
         for (name, entry) in changes {
             if let Some(before) = of.entries.remove(&name) {
-                of.used = of.used.without(before.text.len());
+                of.used = of.used.without(before.bytes());
                 any = true;
             }
             let Some(entry) = entry else {
                 continue;
             };
-            let with = of.used.with(entry.text.len());
+            let with = of.used.with(entry.bytes());
             let has_room = with.plus(same).is_within(Use::OF_GATEWAY)
                 && with.plus(all).is_within(Use::OF_ALL)
                 && (is_certified || with.plus(unproved).is_within(Use::OF_UNPROVED));
@@ -275,6 +304,7 @@ mod tests {
         let name: Arc<str> = format!("agent-{gateway}-{number}").into();
         let received = wire::DfEntry {
             entry: "x".repeat(bytes),
+            addresses: Vec::new(),
             lease: None,
         };
         let agent = (&name, Incarnation::from_u64(1));
@@ -337,6 +367,7 @@ mod tests {
             name: format!("agent-{number}").into(),
             incarnation: Incarnation::from_u64(1),
             text: "x".repeat(bytes).into(),
+            addresses: Vec::new(),
             lease: None,
         };
         let too_long = own(0, Exchange::MAX_DF_ENTRY + 1);
@@ -358,6 +389,7 @@ mod tests {
             name: "a".into(),
             incarnation: Incarnation::from_u64(1),
             text: "x".into(),
+            addresses: Vec::new(),
             lease: time_left.map(|time_left| now + time_left),
         };
         let read = |received_entry| {
@@ -377,6 +409,7 @@ mod tests {
         }
         let with_lease = |lease| wire::DfEntry {
             entry: String::new(),
+            addresses: Vec::new(),
             lease: Some(lease),
         };
         assert_eq!(read(with_lease(0)), None);
@@ -387,12 +420,35 @@ mod tests {
     }
 
     #[test]
+    fn addresses_beyond_the_bounds_are_left_out() {
+        let read = |addresses: Vec<String>| {
+            let agent = (&"a".into(), Incarnation::from_u64(1));
+            let of = (Incarnation::from_u64(2), Principal::Unproved);
+            let received = wire::DfEntry {
+                entry: "x".to_owned(),
+                addresses,
+                lease: None,
+            };
+            DfEntry::read(Instant::now(), of, agent, received).unwrap()
+        };
+        let long = "x".repeat(Exchange::MAX_DF_ADDRESS);
+        let most = vec![long.clone(); Exchange::MAX_DF_ADDRESSES];
+        assert_eq!(read(most.clone()).addresses, most);
+        assert_eq!(read(most.clone()).bytes(), 1 + most.len() * long.len());
+        let many = [most, vec![String::new()]].concat();
+        for beyond in [many, vec![long + "x"]] {
+            assert!(read(beyond).addresses.is_empty());
+        }
+    }
+
+    #[test]
     fn the_weight_of_a_text_is_at_least_its_length_in_a_letter() {
         for text in ["plain", "\"\\\"", "\0\n\u{1b}\u{7f}", "né 🤖"] {
             let own = OwnDfEntry {
                 name: "a".into(),
                 incarnation: Incarnation::from_u64(1),
                 text: text.into(),
+                addresses: vec![text.to_owned(); 3],
                 lease: Some(Instant::now() + Duration::from_millis(u64::MAX >> 20)),
             };
             let on_wire = serde_json::to_string(&own.to_wire(Instant::now())).unwrap();

@@ -221,6 +221,10 @@ impl Exchange {
     pub const MAX_DF_ENTRIES: usize = 256;
     /// Maximum length of these entries together, in bytes.
     pub const MAX_DF_BYTES: usize = 128 * 1024;
+    /// Maximum number of addresses of one DF entry.
+    pub const MAX_DF_ADDRESSES: usize = 4;
+    /// Maximum length of an address of a DF entry, in bytes.
+    pub const MAX_DF_ADDRESS: usize = 128;
     /// Maximum number of DF entries of all neighbors. Neighbors without certificates have at most half
     /// of them.
     pub const MAX_TOTAL_DF_ENTRIES: usize = 2048;

@@ -107,6 +107,9 @@ pub(super) struct Agent {
 pub(super) struct DfEntry {
     /// The description of the agent in FIPA-SL, without its lease.
     pub(super) entry: String,
+    /// The addresses at which agents of other platforms reach the agent.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(super) addresses: Vec<String>,
     /// Milliseconds until the lease ends.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) lease: Option<u64>,
@@ -155,7 +158,7 @@ mod tests {
     const LETTER: &str = concat!(
         r#"{"version":1,"tell":{"full":{"version":3,"first":true,"last":true,"agents":["#,
         r#"{"name":"crane","id":"0000000000000007","type":"arm","registered":1000,"#,
-        r#""df":{"entry":"(df-agent-description :languages (set \"a\\n\"))","lease":60000}},"#,
+        r#""df":{"entry":"(df-agent-description :languages (set \"a\\n\"))","addresses":["http://10.0.0.1:7778/acc"],"lease":60000}},"#,
         r#"{"name":"rover","id":"0000000000000008","registered":1000,"df":{"entry":""}}]}}}"#
     );
 
@@ -172,8 +175,12 @@ mod tests {
 
     #[test]
     fn a_letter_with_df_entries_has_these_bytes() {
-        let of = |entry: &str, lease| DfEntry {
+        let of = |entry: &str, lease: Option<u64>| DfEntry {
             entry: entry.to_owned(),
+            addresses: lease
+                .map(|_| "http://10.0.0.1:7778/acc".to_owned())
+                .into_iter()
+                .collect(),
             lease,
         };
         let text = r#"(df-agent-description :languages (set "a\n"))"#;
@@ -208,6 +215,8 @@ mod tests {
             r#""text""#,
             "{}",
             r#"{"entry":7}"#,
+            r#"{"entry":"","addresses":"http://10.0.0.1:7778/acc"}"#,
+            r#"{"entry":"","addresses":[1]}"#,
             r#"{"entry":"","lease":-1}"#,
             r#"{"entry":"","lease":1.5}"#,
             r#"{"entry":"","lease":18446744073709551616}"#,

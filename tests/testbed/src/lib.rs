@@ -35,6 +35,7 @@
 mod avahi;
 mod child;
 mod http_requests;
+pub mod jade;
 pub mod languages;
 mod network;
 mod packet_repeater;

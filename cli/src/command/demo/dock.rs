@@ -1,6 +1,5 @@
 //! `fipa demo dock`: two robots fetch, reserve and dock items, and become one.
 
-use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -61,11 +60,15 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
     /// The program of the items, which runs instead of this one
-    #[arg(long, hide = true, value_name = "PROGRAM")]
-    item: Option<OsString>,
-    /// The program of the operator, which runs instead of this one, with its part as JSON
-    #[arg(long, value_name = "PROGRAM")]
-    operator: Option<OsString>,
+    #[arg(long, hide = true, value_name = "PROGRAM", value_parser = program)]
+    item: Option<PathBuf>,
+    /// The program of the operator, which runs instead of this one
+    ///
+    /// The demo starts it with its part as JSON, in which `platform` has the name and the HTTP address of the gateway, for
+    /// an agent of another platform such as JADE. The program writes its claims to standard output, one JSON object
+    /// in a line. The last one is `finished`. It ends when its standard input is closed.
+    #[arg(long, value_name = "PROGRAM", value_parser = program)]
+    operator: Option<PathBuf>,
     /// Open the dashboard of the first gateway. The demo prints its link, and waits for Enter before the robots start and
     /// before they end
     #[arg(long, conflicts_with = "json")]
@@ -84,6 +87,15 @@ fn part(text: &str) -> Result<Part, String> {
 
 fn mutant(text: &str) -> Result<Mutant, String> {
     serde_json::from_value(json!(text)).map_err(|error| error.to_string())
+}
+
+/// Reads a path as one from the present directory: the processes of the demo run in another one.
+fn program(text: &str) -> Result<PathBuf, String> {
+    match text.contains('/') {
+        true => std::path::absolute(text).map_err(|error| error.to_string()),
+        // A command of `PATH`.
+        false => Ok(text.into()),
+    }
 }
 
 fn rate(text: &str) -> Result<f64, String> {
@@ -112,8 +124,8 @@ pub(super) fn run(arguments: Arguments) -> Result<(), Failure> {
         },
         mutant: arguments.mutant,
         program: launch::own_program(&["demo", "dock", "--part"]).map_err(failed)?,
-        item: arguments.item.map(|program| vec![program]),
-        operator: arguments.operator.map(|program| vec![program]),
+        item: arguments.item.map(|program| vec![program.into()]),
+        operator: arguments.operator.map(|program| vec![program.into()]),
         dashboard: arguments.dashboard,
     };
     // A file that cannot be written is an error before the run, not after it.

@@ -13,10 +13,9 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_acl::escape;
-use fipa_transport::{
-    Answer, Conclusion, FailureReason, Kind, Location, Signature, TransportError,
-    TransportErrorKind,
-};
+#[cfg(feature = "secure")]
+use fipa_transport::{Answer, FailureReason};
+use fipa_transport::{Conclusion, Kind, Location, Signature, TransportError, TransportErrorKind};
 use socket2::SockRef;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
