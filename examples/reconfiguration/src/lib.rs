@@ -19,10 +19,14 @@ mod fetching;
 pub mod geometry;
 pub mod hardware;
 #[cfg(feature = "robots")]
+mod guidance;
+#[cfg(feature = "robots")]
 mod host;
 pub mod item;
 #[cfg(feature = "robots")]
 pub mod launch;
+#[cfg(feature = "robots")]
+mod looking;
 #[cfg(feature = "robots")]
 mod operator;
 mod owning;

@@ -8,7 +8,6 @@ use fipa::protocol::ContractNet;
 use fipa::{Agent, AgentId, Domain, Message, Performative};
 
 use crate::fetching;
-use crate::geometry::Pose;
 use crate::part::{Failed, Part, Stop};
 use crate::report::{Claim, Reporter};
 use crate::sherpa::{self, Dock, DockResult};
@@ -46,16 +45,6 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
     drop(operator);
     domain.close().await;
     Ok(())
-}
-
-/// Returns the pose in the description of a service.
-pub(crate) fn pose(service: &ServiceDescription) -> Option<Pose> {
-    let mut all = service.properties.iter();
-    let pose = all
-        .find(|property| property.name == "pose")?
-        .value
-        .as_ref()?;
-    serde_json::from_str(pose.as_str()?).ok()
 }
 
 struct Operator<'a> {
@@ -96,10 +85,7 @@ impl Operator<'_> {
 
     /// Waits until this number of agents has a service.
     async fn find(&self, service: &str, number: usize) -> Result<Vec<AgentDescription>, Failed> {
-        let template = AgentDescription {
-            services: vec![ServiceDescription::of_type(service)],
-            ..AgentDescription::default()
-        };
+        let template = ServiceDescription::of_type(service).into();
         loop {
             let found = self.agent.df()?.search(&template).await?;
             if found.len() >= number {
@@ -124,23 +110,17 @@ impl Operator<'_> {
         let robots: Vec<AgentId> = robots.iter().filter_map(|it| it.name.clone()).collect();
         let mut nets = Vec::new();
         for item in items {
-            let name = item
-                .name
-                .as_ref()
-                .ok_or("an item has no name")?
-                .name()
-                .to_owned();
-            let pose = item
-                .services
-                .iter()
-                .find_map(pose)
-                .ok_or("an item has no pose")?;
-            let item = name.clone();
+            let name = item.name.as_ref().ok_or("an item has no name")?.name();
+            let pose = item.services.iter().find_map(words::pose);
+            let fetch = Fetch {
+                item: name.to_owned(),
+                pose: pose.ok_or("an item has no pose")?,
+            };
             let call = self.agent.message(Performative::Cfp);
-            let call = call.content(words::say(&Fetch { item, pose }));
+            let call = call.content(words::say(&fetch));
             let net = self.agent.contract_net(call, &robots, TIMEOUT).await?;
             let bids: Bids = net.bids().proposals.iter().filter_map(bid).collect();
-            nets.push((name, net, bids));
+            nets.push((fetch.item, net, bids));
         }
         let [(first, net_1, bids_1), (second, net_2, bids_2)] = nets.as_mut_slice() else {
             return Err("expected two items".into());
