@@ -13,8 +13,8 @@ use fipa_acl::{AgentId, Message, Performative, Time};
 use fipa_content::{SlDialect, Term};
 use fipa_platform::{
     AgentDescription, AgentState, AmsDescription, Asker, Constraints, Exception, Function,
-    Platform, ServiceDescription, StoredDescription, StoredSubscription, limits,
-    notified, subscription,
+    Platform, ServiceDescription, StoredDescription, StoredSubscription, limits, notified,
+    subscription,
 };
 
 fn subscribe_message(from: &str, conversation: &str) -> Message {

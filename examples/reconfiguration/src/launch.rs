@@ -362,7 +362,12 @@ impl Run<'_> {
         };
         let program = own.unwrap_or(&self.options.program);
         let (program, arguments) = program.split_first().ok_or("no program")?;
-        let mut child = Command::new(program)
+        let mut command = Command::new(program);
+        if role == Role::Item {
+            // A module has little memory. Each thread of glibc would get an arena of its own.
+            command.env("MALLOC_ARENA_MAX", "1");
+        }
+        let mut child = command
             .args(arguments)
             .arg(serde_json::to_string(&part)?)
             .env("FIPA_RUNTIME_DIR", self.dir.path())

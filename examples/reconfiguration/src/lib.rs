@@ -17,9 +17,9 @@ mod fault;
 #[cfg(feature = "robots")]
 mod fetching;
 pub mod geometry;
-pub mod hardware;
 #[cfg(feature = "robots")]
 mod guidance;
+pub mod hardware;
 #[cfg(feature = "robots")]
 mod host;
 pub mod item;

@@ -165,4 +165,3 @@ impl Sherpa {
         Ok(pose.ok_or_else(|| format!("no pose of {item} is listed"))?)
     }
 }
-

@@ -9,7 +9,7 @@ use fipa_reconfiguration::Fault;
 use fipa_reconfiguration::launch::{self, Link, Options, Outcome};
 use fipa_reconfiguration::part::Mutant;
 use fipa_reconfiguration::picture;
-use fipa_reconfiguration::report::Claim;
+use fipa_reconfiguration::report::{Claim, Report};
 use fipa_testbed::languages::{can_import, install_package, python};
 
 /// A run of the program of this package.
@@ -128,6 +128,75 @@ async fn random_faults() {
     }
 }
 
+/// Maximum private memory of an item, in bytes. In the profile `small`, relocations of the program take 232 KB more.
+const ITEM_MEMORY: u64 = 2_750_000;
+
+#[tokio::test]
+async fn an_item_needs_little_memory() {
+    let item = env!("CARGO_BIN_EXE_payload_item");
+    let options = Options {
+        item: Some(vec![item.into()]),
+        ..options(None, 1)
+    };
+    let mut most = 0;
+    let mut show = |report: &Report| {
+        if matches!(report.claim, Claim::Step { .. } | Claim::Image { .. }) {
+            most = children(item)
+                .filter_map(private_memory)
+                .fold(most, u64::max);
+        }
+    };
+    let outcome = launch::run(&options, &mut show).await.unwrap();
+    assert!(outcome.failed.is_empty(), "{:?}", outcome.failed);
+    println!("an item has {most} bytes");
+    assert!((1_000_000..ITEM_MEMORY).contains(&most), "{most} bytes");
+}
+
+/// Returns the processes of this one that run a program.
+fn children(program: &str) -> impl Iterator<Item = u32> {
+    let program = Path::new(program).canonicalize().unwrap();
+    let processes = std::fs::read_dir("/proc").unwrap().flatten();
+    processes.filter_map(move |process| {
+        let runs = std::fs::read_link(process.path().join("exe")).ok()?;
+        let status = std::fs::read_to_string(process.path().join("status")).ok()?;
+        let parent = status.lines().find_map(|line| line.strip_prefix("PPid:"))?;
+        let is_child = parent.trim() == std::process::id().to_string();
+        let pid = process.file_name().to_str()?.parse().ok()?;
+        (is_child && runs == program).then_some(pid)
+    })
+}
+
+/// Returns the private memory of a process in mappings that are neither files nor shared, in bytes. The code of its
+/// program is in files. Images are in memory that is shared.
+fn private_memory(pid: u32) -> Option<u64> {
+    let maps = std::fs::read_to_string(format!("/proc/{pid}/smaps")).ok()?;
+    let (mut sum, mut counts) = (0, false);
+    for line in maps.lines() {
+        let words: Vec<&str> = line.split_ascii_whitespace().collect();
+        match words[..] {
+            ["Private_Clean:" | "Private_Dirty:", kib, _] if counts => {
+                sum += kib.parse::<u64>().unwrap() * 1024;
+            }
+            [_, rights, _, _, inode, ..] if rights.len() == 4 => {
+                counts = rights.ends_with('p') && inode == "0";
+            }
+            _ => {}
+        }
+    }
+    Some(sum)
+}
+
+/// A reader of the example has to see the whole program of an agent.
+#[test]
+fn programs_of_agents_are_short() {
+    let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    for program in ["operator", "sherpa", "guidance", "crex", "item", "rogue"] {
+        let source = std::fs::read_to_string(sources.join(format!("{program}.rs"))).unwrap();
+        let lines = source.lines().count();
+        assert!(lines <= 250, "{program} has {lines} lines");
+    }
+}
+
 /// The delay is in each step of the guidance.
 #[tokio::test]
 async fn a_slow_link() {
@@ -141,6 +210,8 @@ async fn a_slow_link() {
     });
     let outcome = outcome.await;
     assert!(outcome.failed.is_empty(), "{:?}", outcome.failed);
+    assert!(outcome.steps("approach") > 0 && outcome.steps("align") > 0);
+    assert!(outcome.seconds().is_some_and(|seconds| seconds > 0.0));
 }
 
 #[tokio::test]
