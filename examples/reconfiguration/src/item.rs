@@ -14,6 +14,7 @@ use tokio::sync::{Mutex, Notify};
 
 use crate::face::Face;
 use crate::hardware::{Hardware, HardwareError, IMAGE};
+use crate::leading::give_back;
 use crate::owning::{coalition_options, own_all};
 use crate::part::{Failed, Mutant, Part, Stop};
 use crate::report::{Claim, Reporter};
@@ -59,7 +60,8 @@ pub async fn run(part: &Part) -> Result<(), Failed> {
         let (founded, reporter) = serving.clone();
         grow(task, founded, reporter, obeys_all)
     })?;
-    let _member = agent.join_coalition(crate::COALITION)?;
+    let membership = agent.join_coalition(crate::COALITION)?;
+    let leading = tokio::spawn(give_back(agent.clone(), membership));
     let pose = words::say(&hardware.encoder().await?);
     let service = ServiceDescription::new(&part.name, "payload").with_property("pose", pose);
     agent.df()?.register_service(service).await?;
@@ -85,6 +87,7 @@ pub async fn run(part: &Part) -> Result<(), Failed> {
         }
     }
     camera.abort();
+    leading.abort();
     drop(item);
     domain.close().await;
     Ok(())

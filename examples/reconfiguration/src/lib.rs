@@ -25,6 +25,7 @@ mod host;
 pub mod item;
 #[cfg(feature = "robots")]
 pub mod launch;
+mod leading;
 #[cfg(feature = "robots")]
 mod looking;
 #[cfg(feature = "robots")]
