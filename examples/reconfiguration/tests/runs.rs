@@ -4,6 +4,7 @@
 #![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::path::Path;
+use std::time::Duration;
 
 use fipa_reconfiguration::Fault;
 use fipa_reconfiguration::launch::{self, Link, Options, Outcome};
@@ -11,6 +12,7 @@ use fipa_reconfiguration::part::Mutant;
 use fipa_reconfiguration::picture;
 use fipa_reconfiguration::report::{Claim, Report};
 use fipa_testbed::languages::{can_import, install_package, python};
+use fipa_testbed::send_signal;
 
 /// A run of the program of this package.
 fn options(fault: Option<Fault>, seed: u64) -> Options {
@@ -128,6 +130,38 @@ async fn random_faults() {
     }
 }
 
+/// The robot is stopped when it is to lead: the item leads meanwhile, and gives the lead back.
+#[tokio::test]
+async fn the_client_is_stopped() {
+    const PAUSE: Duration = Duration::from_secs(3);
+    // No other test has it.
+    const SEED: u64 = 12;
+    let mut stopped = None;
+    let mut show = |report: &Report| {
+        if stopped.is_none() && matches!(report.claim, Claim::Confirmed { .. }) {
+            let pid = children(env!("CARGO_BIN_EXE_reconfiguration"))
+                .find(|pid| has_part(*pid, "crex", SEED))
+                .unwrap();
+            send_signal(pid, "-STOP");
+            stopped = Some(std::thread::spawn(move || {
+                std::thread::sleep(PAUSE);
+                send_signal(pid, "-CONT");
+            }));
+        }
+    };
+    let outcome = launch::run(&options(None, SEED), &mut show).await.unwrap();
+    stopped.unwrap().join().unwrap();
+    assert!(outcome.failed.is_empty(), "{:?}", outcome.failed);
+}
+
+/// Whether a process has the part of this name in the run with this seed.
+fn has_part(pid: u32, name: &str, seed: u64) -> bool {
+    let arguments = std::fs::read_to_string(format!("/proc/{pid}/cmdline"));
+    arguments.is_ok_and(|it| {
+        it.contains(&format!("\"name\":\"{name}\"")) && it.contains(&format!("\"seed\":{seed},"))
+    })
+}
+
 /// Maximum private memory of an item, in bytes. In the profile `small`, relocations of the program take 232 KB more.
 const ITEM_MEMORY: u64 = 2_750_000;
 
@@ -201,7 +235,7 @@ fn programs_of_agents_are_short() {
 #[tokio::test]
 async fn a_slow_link() {
     let link = Link {
-        delay: std::time::Duration::from_millis(50),
+        delay: Duration::from_millis(50),
         rate: Some(10e6 / 8.0),
     };
     let outcome = run(Options {
