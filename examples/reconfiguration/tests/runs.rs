@@ -163,7 +163,7 @@ fn has_part(pid: u32, name: &str, seed: u64) -> bool {
 }
 
 /// Maximum private memory of an item, in bytes. In the profile `small`, relocations of the program take 232 KB more.
-const ITEM_MEMORY: u64 = 2_750_000;
+const ITEM_MEMORY: u64 = 2_500_000;
 
 #[tokio::test]
 async fn an_item_needs_little_memory() {
