@@ -216,3 +216,37 @@ impl
         self.0.open(access)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use fipa_transport::Incarnation;
+
+    use super::*;
+
+    #[test]
+    fn the_number_of_files_is_bounded() {
+        let name = format!("fipatest-{}", Incarnation::random());
+        let name = FileName::try_from(name.as_str()).unwrap();
+        let files = Builder::new(&name)
+            .max_chunk_layout_hint(Layout::new::<u64>())
+            .max_number_of_chunks_hint(1)
+            .allocation_strategy(AllocationStrategy::BestFit)
+            .create()
+            .unwrap();
+        // Each is longer than the chunks of the file before.
+        let mut allocated = (1..).map(|number| {
+            let layout = Layout::from_size_align(64 * number, 8).unwrap();
+            files.allocate(layout).map(|chunk| (chunk, layout))
+        });
+        let made: Vec<_> = allocated.by_ref().map_while(Result::ok).collect();
+        assert_eq!(made.len(), MAX_FILES - 1);
+        assert_eq!(
+            allocated.next().unwrap().err(),
+            Some(AllocationError::OutOfMemory)
+        );
+        for (chunk, layout) in made {
+            // SAFETY: the chunk was allocated with this layout, and is not used.
+            unsafe { files.deallocate(chunk, layout) };
+        }
+    }
+}
