@@ -18,8 +18,11 @@ use crate::{COALITION, Fault};
 const TIMEOUT: Duration = Duration::from_secs(20);
 /// Time between two searches.
 const PAUSE: Duration = Duration::from_millis(100);
-/// The number of attempts to dock an item.
-const ATTEMPTS: usize = 3;
+/// Maximum time after which a further attempt to dock an item begins. After a cut of the link, the guide waits up to twice
+/// [`TIMEOUT`] for its client, and refuses others until then.
+const ATTEMPTS: Duration = Duration::from_secs(45);
+/// Time between two attempts.
+const BREAK: Duration = Duration::from_secs(2);
 /// The robot that gets the stack.
 const CLIENT: &str = "crex";
 
@@ -186,11 +189,12 @@ impl Operator<'_> {
             client: CLIENT.to_owned(),
             with,
         };
+        let until = Instant::now() + ATTEMPTS;
         let mut attempt = 1;
         loop {
             match self.attempt(guide, &goal).await {
                 Ok(_) => return Ok(()),
-                Err(error) if attempt == ATTEMPTS || self.gives_up(item).await => {
+                Err(error) if Instant::now() >= until || self.gives_up(item).await => {
                     return Err(error);
                 }
                 Err(error) => self
@@ -198,6 +202,7 @@ impl Operator<'_> {
                     .noticed(format!("attempt {attempt} to dock {item}: {error}")),
             }
             attempt += 1;
+            tokio::time::sleep(BREAK).await;
         }
     }
 
