@@ -295,10 +295,7 @@ async fn a_description_in_a_directory_facilitator_leads_to_the_platform_that_reg
         Performative::Inform,
         "{answer:?}"
     );
-    let selling = fipa::platform::AgentDescription {
-        services: vec![fipa::platform::ServiceDescription::of_type("selling")],
-        ..Default::default()
-    };
+    let selling = fipa::platform::ServiceDescription::of_type("selling").into();
     let found = rover.df().unwrap().search(&selling).await.unwrap();
     let seller = found[0].name.clone().unwrap();
     assert_eq!(seller.addresses(), [third.address()]);

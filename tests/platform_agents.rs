@@ -49,18 +49,12 @@ async fn knows(domain: &Domain, name: &str) {
 }
 
 fn lifting() -> AgentDescription {
-    AgentDescription {
-        services: vec![ServiceDescription::of_type("lifting")],
-        ..AgentDescription::default()
-    }
+    ServiceDescription::of_type("lifting").into()
 }
 
 /// Returns a description with one service of this name.
 fn lifting_as(name: &str) -> AgentDescription {
-    AgentDescription {
-        services: vec![ServiceDescription::new(name, "lifting")],
-        ..AgentDescription::default()
-    }
+    ServiceDescription::new(name, "lifting").into()
 }
 
 fn names<'a>(ids: impl IntoIterator<Item = &'a Option<AgentId>>) -> Vec<String> {
@@ -728,10 +722,7 @@ async fn topics_are_listed_by_the_next_gateway() {
     let camera = domain.register("camera").await.unwrap();
     let viewer = domain.register("viewer").await.unwrap();
     let _image = camera.publisher("image").unwrap();
-    let topics = AgentDescription {
-        services: vec![ServiceDescription::of_type("topic")],
-        ..AgentDescription::default()
-    };
+    let topics = ServiceDescription::of_type("topic").into();
     until_listed(&viewer.df().unwrap(), &topics, &["image"]).await;
     gateway.close().await;
     until_async("the directory facilitator ends", || viewer.df().is_err()).await;

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use fipa::admin::keys::{Keys, VALID};
 use fipa::admin::routes;
-use fipa::platform::{AgentDescription, ServiceDescription};
+use fipa::platform::ServiceDescription;
 use fipa::{Agent, Config, Domain, FailureReason, Gateway, Kind, Outcome};
 use fipa_testbed::until_async;
 use support::{config, inform, mark};
@@ -85,10 +85,7 @@ async fn a_revoked_host_ends_with_its_agents_its_services_and_the_letters_for_it
     let (arm, crane) = (arm.name().to_owned(), crane.name().to_owned());
     knows(&ours, &arm).await;
     let df = rover.df().unwrap();
-    let lifting = AgentDescription {
-        services: vec![ServiceDescription::of_type("lifting")],
-        ..AgentDescription::default()
-    };
+    let lifting = ServiceDescription::of_type("lifting").into();
     while df.search(&lifting).await.unwrap().is_empty() {}
 
     let mut letters = tokio::task::JoinSet::new();

@@ -213,6 +213,16 @@ impl AgentDescription {
     }
 }
 
+/// The template of all agents that have a service.
+impl From<ServiceDescription> for AgentDescription {
+    fn from(service: ServiceDescription) -> Self {
+        Self {
+            services: vec![service],
+            ..Self::default()
+        }
+    }
+}
+
 impl ServiceDescription {
     /// Returns a service with this name and type.
     #[must_use]
@@ -230,6 +240,27 @@ impl ServiceDescription {
             service_type: Some(service_type.into()),
             ..Self::default()
         }
+    }
+
+    /// Adds a property.
+    #[must_use]
+    pub fn with_property(
+        mut self,
+        name: impl Into<String>,
+        value: impl Into<Term<'static>>,
+    ) -> Self {
+        self.properties.push(Property::new(name, value));
+        self
+    }
+
+    /// Returns the value of the first property with this name.
+    #[must_use]
+    pub fn property(&self, name: &str) -> Option<&Term<'static>> {
+        let mut properties = self.properties.iter();
+        properties
+            .find(|property| property.name == name)?
+            .value
+            .as_ref()
     }
 
     fn from_term(term: &Term<'_>) -> Result<Self, Exception> {

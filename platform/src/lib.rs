@@ -24,10 +24,7 @@
 //!     services: vec![ServiceDescription::new("lift-1", "lifting")],
 //!     ..AgentDescription::default()
 //! };
-//! let template = AgentDescription {
-//!     services: vec![ServiceDescription::of_type("lifting")],
-//!     ..AgentDescription::default()
-//! };
+//! let template = AgentDescription::from(ServiceDescription::of_type("lifting"));
 //! let now = PlatformTime { at: Instant::now(), wall: SystemTime::now() };
 //! for (sender, function) in [
 //!     ("crane", Function::register(&crane)),

@@ -100,6 +100,8 @@ fn values_of_properties_are_compared_by_their_types() {
         ],
         ..ServiceDescription::new("lift-1", "lifting")
     };
+    assert_eq!(registered.property("load"), Some(&value("5")));
+    assert_eq!(registered.property("weight"), None);
     let description = AgentDescription {
         services: vec![registered],
         ..lifting("crane")

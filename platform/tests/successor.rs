@@ -13,8 +13,8 @@ use fipa_acl::{AgentId, Message, Performative, Time};
 use fipa_content::{SlDialect, Term};
 use fipa_platform::{
     AgentDescription, AgentState, AmsDescription, Asker, Constraints, Exception, Function,
-    Platform, Property, ServiceDescription, StoredDescription, StoredSubscription, limits,
-    notified, subscription,
+    Platform, ServiceDescription, StoredDescription, StoredSubscription, limits, notified,
+    subscription,
 };
 
 fn subscribe_message(from: &str, conversation: &str) -> Message {
@@ -77,11 +77,9 @@ fn drain(it: &mut Facilitator) {
 
 /// A description with each slot, and a text that is not UTF-8.
 fn full(name: &str) -> AgentDescription {
-    let mut service = ServiceDescription::new("lift \"1\"", "lifting");
-    service.properties = vec![
-        Property::new("load", "12 kg"),
-        Property::new("raw", Term::Bytes(vec![0xff, 0, b'"'].into())),
-    ];
+    let service = ServiceDescription::new("lift \"1\"", "lifting")
+        .with_property("load", "12 kg")
+        .with_property("raw", Term::Bytes(vec![0xff, 0, b'"'].into()));
     AgentDescription {
         languages: vec!["fipa-sl é".to_owned()],
         services: vec![service],

@@ -13,10 +13,7 @@
 //!     .register_service(ServiceDescription::new("lift-1", "lifting"))
 //!     .await?;
 //!
-//! let lifting = AgentDescription {
-//!     services: vec![ServiceDescription::of_type("lifting")],
-//!     ..AgentDescription::default()
-//! };
+//! let lifting = AgentDescription::from(ServiceDescription::of_type("lifting"));
 //! for found in rover.df()?.search(&lifting).await? {
 //!     println!("{:?}", found.name);
 //! }

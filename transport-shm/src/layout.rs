@@ -36,7 +36,7 @@ pub(crate) const ANSWERS: usize = 1024;
 
 /// Version of this layout and of the status page. iceoryx2 refuses other versions, because their
 /// types have other names.
-const VERSION: u32 = 6;
+const VERSION: u32 = 7;
 
 /// The user header of every request.
 ///

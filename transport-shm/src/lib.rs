@@ -24,7 +24,7 @@
 //! | `presence` | liveness FIFO, doorbell and status page of a process |
 //! | `peers` | the other processes that an endpoint has open |
 //! | `combiner` | work that one thread does for all |
-//! | `memory`, `storage`, `sync_policy`, `variant` | free-space checks and page allocation; the files of iceoryx2 with allocated pages; the lock of its ports; the iceoryx2 service variant that uses them |
+//! | `memory`, `storage`, `payload_files`, `sync_policy`, `variant` | free-space checks and page allocation; the files of iceoryx2 with allocated pages; fewer of them per port; the lock of its ports; the iceoryx2 service variant that uses them |
 //! | `domain_files` | the files of a domain, their creation and cleanup |
 //! | `errors` | mapping of iceoryx2 errors to transport errors |
 //! | `fork` | detection of forked children |
@@ -67,6 +67,7 @@ mod memory;
 mod outbox;
 mod parcel_writer;
 mod paths;
+mod payload_files;
 mod peer_segments;
 mod peers;
 mod pool;

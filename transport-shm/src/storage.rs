@@ -67,13 +67,15 @@ pub(crate) const MAX_CHUNKS: usize = 2048;
 const TAIL: usize = 4 * MAX_CHUNKS + (8 << 10);
 
 /// A file of iceoryx2. If `SPARSE` is true, only a part of its pages is allocated at once.
+///
+/// It is small: iceoryx2 has a table with room for 255 files of payloads per connection, of which one or two are open.
 #[derive(Debug)]
 pub(crate) struct Storage<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> {
-    name: FileName,
+    name: Box<FileName>,
     data: NonNull<Data<T>>,
     // Before `file`, whose descriptor it stores.
     _registered: Option<Registration>,
-    file: SharedMemory,
+    file: Box<SharedMemory>,
 }
 
 // SAFETY: `data` points into memory that every process of the domain may use concurrently, and `T`
@@ -96,10 +98,10 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Storage<T, SPARS
     /// Wraps a mapped file. `None` if the file is too short.
     fn new(name: FileName, file: SharedMemory) -> Option<Self> {
         (file.size() >= size_of::<Data<T>>()).then(|| Self {
-            name,
+            name: Box::new(name),
             data: file.base_address().cast(),
             _registered: None,
-            file,
+            file: Box::new(file),
         })
     }
 
@@ -134,7 +136,7 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Abandonable for 
         let this = unsafe { this.as_mut() };
         this._registered = None;
         // SAFETY: `file` is a field of that storage, and is not used afterwards either.
-        unsafe { SharedMemory::abandon_in_place(NonNull::from_mut(&mut this.file)) };
+        unsafe { SharedMemory::abandon_in_place(NonNull::from_mut(&mut *this.file)) };
     }
 }
 
@@ -591,6 +593,12 @@ mod tests {
         drop(storage);
         assert_eq!(allocate_all(base), Err(Errno::FAULT));
         assert!(!path.exists());
+    }
+
+    /// A large one costs each connection its size 255 times.
+    #[test]
+    fn a_storage_is_small() {
+        assert!(size_of::<Storage<u64, true>>() <= size_of::<[usize; 8]>());
     }
 
     #[test]

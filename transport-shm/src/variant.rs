@@ -6,22 +6,18 @@ use iceoryx2::prelude::ZeroCopySend;
 use iceoryx2::service::Service;
 use iceoryx2::service::internal::ServiceInternal;
 use iceoryx2_bb_elementary_traits::testing::abandonable::Abandonable;
-use iceoryx2_cal::resizable_shared_memory::dynamic::DynamicMemory;
-use iceoryx2_cal::shared_memory::common::details::{AllocatorDetails, Memory};
 use iceoryx2_cal::shm_allocator::bump_allocator::BumpAllocator;
 use iceoryx2_cal::shm_allocator::pool_allocator::PoolAllocator;
 use iceoryx2_cal::zero_copy_connection::common::details::{Connection, SharedManagementData};
 use iceoryx2_cal::{bag, event, hash, monitoring, reactor, serialize};
 
+use crate::payload_files::{PayloadFiles, Payloads};
 use crate::static_file::StaticFile;
 use crate::storage::Storage;
 use crate::sync_policy::Locked;
 
-/// Memory of payloads.
-type Payloads<A> = Memory<A, Storage<AllocatorDetails<A>, true>>;
-
 /// `ipc_threadsafe::Service`, except that the pages of its files are allocated before use, that its
-/// descriptions are not synchronized with the disk, and that its lock is cheaper.
+/// descriptions are not synchronized with the disk, that a port has fewer files of payloads, and that its lock is cheaper.
 #[derive(Debug, Clone)]
 pub(crate) struct Svc {}
 
@@ -34,7 +30,7 @@ impl Service for Svc {
     type DynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> = Storage<T, false>;
     type ServiceNameHasher = hash::recommended::Recommended;
     type SharedMemory = Payloads<PoolAllocator>;
-    type ResizableSharedMemory = DynamicMemory<PoolAllocator, Payloads<PoolAllocator>>;
+    type ResizableSharedMemory = PayloadFiles;
     type Connection = Connection<Storage<SharedManagementData, false>>;
     type Event = event::recommended::Ipc;
     type Monitoring = monitoring::recommended::Ipc;

@@ -211,10 +211,7 @@ pub(crate) fn tip_for_one_argument(name: &str, sources: &Sources) -> Option<Stri
 pub(super) async fn list_all(agent: &Arc<Agent>, config: &Config) -> Result<Listed, Failure> {
     match agent.df() {
         Ok(df) => {
-            let topics = AgentDescription {
-                services: vec![ServiceDescription::of_type("topic")],
-                ..AgentDescription::default()
-            };
+            let topics = AgentDescription::from(ServiceDescription::of_type("topic"));
             let found = df.search(&topics).await;
             let found = found.map_err(|error| super::df::failed(&error, config))?;
             let names = found.into_iter().filter_map(|it| it.name);

@@ -5,21 +5,20 @@ use std::time::Duration;
 
 use fipa::coalitions::{CoalitionState, Membership};
 use fipa::locks::Owned;
-use fipa::protocol::{Reply, Task};
 use fipa::topics::{Publisher, Topic};
-use fipa::{Agent, Domain, Message, Performative};
-use tokio::sync::Mutex;
+use fipa::{Domain, Message, Performative};
 
 use crate::COALITION;
-use crate::face::{Contact, Face};
+use crate::face::Contact;
 use crate::fetching::{self, Way};
 use crate::geometry::Pose;
-use crate::hardware::{Hardware, Sight};
+use crate::hardware::Hardware;
+use crate::looking::{self, Stack};
 use crate::owning::own_all;
 use crate::part::{Failed, Part, Stop};
 use crate::report::{Claim, Reporter};
 use crate::taking_part::{Event, Open, Side};
-use crate::words::{self, Drive, IMAGES, Members, POSE};
+use crate::words::{self, Drive, Members, POSE};
 
 /// The pose of its interface at its body.
 const TOP: Pose = Pose::new(0.3, 0.0, 0.0);
@@ -29,9 +28,6 @@ const ITEM: f64 = 0.2;
 const RATE: f64 = 20.0;
 /// Maximum wait for the answer of another agent.
 const TIMEOUT: Duration = Duration::from_secs(10);
-
-/// The items in front of the robot, the first one at its own interface.
-type Stack = Arc<Mutex<Vec<String>>>;
 
 struct Crex<'a> {
     side: Side<'a>,
@@ -56,15 +52,7 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
     let publishing = tokio::spawn(publish(poses, encoder, Arc::clone(&stack)));
     let membership = agent.join_coalition(COALITION)?;
     let _fetching = fetching::offer(part, &agent, Way::InFront { part: TOP }).await?;
-    let looking = (agent.clone(), Arc::clone(&stack), reporter.clone());
-    let _server = agent.serve("fipa-request", move |task| {
-        let (agent, stack, reporter) = looking.clone();
-        async move {
-            look(task, agent, stack, reporter)
-                .await
-                .map_err(|error| error.to_string())
-        }
-    })?;
+    let _looking = looking::offer(&agent, &stack, &reporter)?;
     reporter.claim(Claim::Ready);
 
     let mut changes = membership.changes();
@@ -88,7 +76,7 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
         }
     }
     publishing.abort();
-    drop((crex, _server, _fetching));
+    drop((crex, _looking, _fetching));
     domain.close().await;
     Ok(())
 }
@@ -108,31 +96,6 @@ async fn publish(poses: Publisher, mut encoder: Hardware, stack: Stack) -> Resul
 fn front(stack: &[String]) -> Pose {
     let items = u32::try_from(stack.len()).unwrap_or(u32::MAX);
     TOP.then(Pose::new(ITEM * f64::from(items), 0.0, 0.0))
-}
-
-/// Looks with the camera of the last item: it is a part of the merged robot now.
-async fn look(
-    _task: Task,
-    agent: Agent,
-    stack: Stack,
-    reporter: Reporter,
-) -> Result<Reply, Failed> {
-    let Some(of) = stack.lock().await.last().cloned() else {
-        return Ok(Reply::Refuse("no item is docked".into()));
-    };
-    let subscribe = agent.message(Performative::Subscribe).receiver(of.as_str());
-    let mut images = agent.subscribe(subscribe.content(IMAGES), TIMEOUT).await?;
-    let image = images.next().await?;
-    images.cancel(TIMEOUT).await?;
-    let bytes = image.message().content().map_or(&[][..], |content| content);
-    let marker = Sight::find(bytes).map(|sight| sight.marker.to_string());
-    let claim = Claim::Image {
-        of,
-        bytes: bytes.len(),
-        marker,
-    };
-    reporter.claim(claim);
-    Ok(Reply::Inform(words::say(&bytes.len()).into()))
 }
 
 impl Crex<'_> {
@@ -164,24 +127,21 @@ impl Crex<'_> {
 
     /// Moves its free interface at the velocity that the master wants.
     async fn drive(&mut self, message: &Message) -> Result<(), Failed> {
-        let Some(Drive { twist }) = words::hear(message) else {
-            self.side
-                .answer(message, Performative::Refuse, "expected a velocity")
-                .await;
-            return Ok(());
+        let asked = words::hear(message).ok_or_else(|| "expected a velocity".to_owned());
+        let admitted = asked.and_then(|drive: Drive| {
+            let admitted = self.side.admit(message, &self.drive, "drive");
+            admitted.map(|()| drive.twist)
+        });
+        let (act, content) = match admitted {
+            Ok(twist) => {
+                let front = front(&self.stack.lock().await);
+                self.hardware.drive(twist.of_body(front)).await?;
+                let pose = self.hardware.encoder().await?.then(front);
+                (Performative::Inform, words::say(&pose))
+            }
+            Err(reason) => (Performative::Refuse, reason),
         };
-        if let Err(reason) = self.side.admit(message, &self.drive, "drive") {
-            self.side
-                .answer(message, Performative::Refuse, reason)
-                .await;
-            return Ok(());
-        }
-        let front = front(&self.stack.lock().await);
-        self.hardware.drive(twist.of_body(front)).await?;
-        let pose = self.hardware.encoder().await?.then(front);
-        self.side
-            .answer(message, Performative::Inform, words::say(&pose))
-            .await;
+        self.side.answer(message, act, content).await;
         Ok(())
     }
 
@@ -190,52 +150,43 @@ impl Crex<'_> {
         let Some(Open { words, .. }) = &self.side.docking else {
             return Ok(());
         };
-        let (face, with, words) = (words.face.clone(), words.with.clone(), words.clone());
-        let felt = match with.body == self.side.part.name {
-            true => self.hardware.contact(&with.side).await? == Some(face.clone()),
-            // The interface is that of an item, which its own program asks.
-            false => true,
-        };
+        let contact = words.contact();
+        let Contact { face, other } = &contact;
+        // The interface of an item is asked by the program of the item.
+        let felt = other.body != self.side.part.name
+            || self.hardware.contact(&other.side).await?.as_ref() == Some(face);
         self.hardware.stop().await?;
         if !felt {
-            self.tell(Performative::Disconfirm, "the interface feels nothing")
-                .await;
+            let nothing = "the interface feels nothing";
+            self.tell(Performative::Disconfirm, nothing).await;
             return Ok(());
         }
-        let contact = Contact { face, other: with };
-        self.side.reporter.claim(Claim::Confirmed {
-            contact: contact.clone(),
-        });
+        let item = face.body.clone();
+        self.side.reporter.claim(Claim::Confirmed { contact });
         self.tell(Performative::Confirm, "").await;
         self.side.end();
-        self.joined(&words.face).await;
+        self.joined(item).await;
         Ok(())
     }
 
     /// Takes the item into the stack, and asks the founder to list it.
-    async fn joined(&mut self, face: &Face) {
+    async fn joined(&mut self, item: String) {
         let mut stack = self.stack.lock().await;
-        stack.push(face.body.clone());
+        stack.push(item);
         let [founder, _, ..] = stack.as_slice() else {
             return;
         };
         let (founder, mut members) = (founder.clone(), vec![self.side.part.name.clone()]);
         members.extend(stack.iter().cloned());
         drop(stack);
-        let ask = self
-            .side
-            .agent
-            .message(Performative::Request)
-            .receiver(founder);
+        let agent = &self.side.agent;
+        let ask = agent.message(Performative::Request).receiver(founder);
         let ask = ask.content(words::say(&Members { members }));
         let asked = async {
             // It leads as soon as the first item has founded the coalition.
             tokio::time::timeout(TIMEOUT, self.membership.leads()).await??;
-            let mut request = self
-                .side
-                .agent
-                .request(self.membership.guard(ask)?, TIMEOUT)
-                .await?;
+            let ask = self.membership.guard(ask)?;
+            let mut request = agent.request(ask, TIMEOUT).await?;
             Ok::<_, Failed>(request.result().await?)
         };
         if let Err(error) = asked.await {

@@ -6,14 +6,15 @@ use std::time::Duration;
 
 use fipa::coalitions::LedCoalition;
 use fipa::locks::Owned;
-use fipa::platform::{Property, ServiceDescription};
+use fipa::platform::ServiceDescription;
 use fipa::protocol::{DialogueError, Reply, Task};
 use fipa::topics::{Publisher, Topic};
 use fipa::{Domain, Message, Performative};
 use tokio::sync::{Mutex, Notify};
 
-use crate::face::{Contact, Face};
+use crate::face::Face;
 use crate::hardware::{Hardware, HardwareError, IMAGE};
+use crate::leading::give_back;
 use crate::owning::{coalition_options, own_all};
 use crate::part::{Failed, Mutant, Part, Stop};
 use crate::report::{Claim, Reporter};
@@ -53,19 +54,16 @@ pub async fn run(part: &Part) -> Result<(), Failed> {
     let images = Topic::new(IMAGES).media_type("image/x-marker").rate(RATE);
     let camera = tokio::spawn(publish(agent.publisher(images)?, camera));
     let founded = Founded::default();
-    let serving = (
-        Arc::clone(&founded),
-        reporter.clone(),
-        part.has(Mutant::LeaderNotFenced),
-    );
+    let obeys_all = part.has(Mutant::LeaderNotFenced);
+    let serving = (Arc::clone(&founded), reporter.clone());
     let _server = agent.serve("fipa-request", move |task| {
-        let (founded, reporter, obeys_all) = serving.clone();
-        async move { grow(task, founded, reporter, obeys_all).await }
+        let (founded, reporter) = serving.clone();
+        grow(task, founded, reporter, obeys_all)
     })?;
-    let _member = agent.join_coalition(crate::COALITION)?;
+    let membership = agent.join_coalition(crate::COALITION)?;
+    let leading = tokio::spawn(give_back(agent.clone(), membership));
     let pose = words::say(&hardware.encoder().await?);
-    let mut service = ServiceDescription::new(&part.name, "payload");
-    service.properties.push(Property::new("pose", pose));
+    let service = ServiceDescription::new(&part.name, "payload").with_property("pose", pose);
     agent.df()?.register_service(service).await?;
     reporter.claim(Claim::Ready);
 
@@ -89,6 +87,7 @@ pub async fn run(part: &Part) -> Result<(), Failed> {
         }
     }
     camera.abort();
+    leading.abort();
     drop(item);
     domain.close().await;
     Ok(())
@@ -166,11 +165,7 @@ impl Item<'_> {
         let Some(Open { words, .. }) = &self.side.docking else {
             return Ok(());
         };
-        let client = words.client.clone();
-        let contact = Contact {
-            face: words.face.clone(),
-            other: words.with.clone(),
-        };
+        let (client, contact) = (words.client.clone(), words.contact());
         let Some(owned) = lock_of(&self.owned, &contact.face) else {
             return Ok(());
         };

@@ -82,6 +82,27 @@ pub struct Outcome {
     pub failed: Vec<String>,
 }
 
+impl Outcome {
+    /// Returns the number of steps of guidance in a phase, `approach` or `align`.
+    #[must_use]
+    pub fn steps(&self, of: &str) -> usize {
+        let is_step = |it: &&Report| matches!(&it.claim, Claim::Step { phase, .. } if phase == of);
+        self.reports.iter().filter(is_step).count()
+    }
+
+    /// Returns the time from the first award of the operator to the end of its work, in seconds.
+    #[must_use]
+    pub fn seconds(&self) -> Option<f64> {
+        let at = |is_it: fn(&Claim) -> bool| {
+            let found = self.reports.iter().find(|it| is_it(&it.claim));
+            found.map(|it| it.at)
+        };
+        let start = at(|claim| matches!(claim, Claim::Award { .. }))?;
+        let end = at(|claim| matches!(claim, Claim::Finished { .. }))?;
+        Some(end.saturating_sub(start) as f64 / 1e6)
+    }
+}
+
 struct Process {
     child: Child,
     /// Dropping it asks the process to end.
@@ -344,7 +365,12 @@ impl Run<'_> {
         let program = own.unwrap_or(&self.options.program);
         let (program, arguments) = program.split_first().ok_or("no program")?;
         let failed = |error| format!("cannot start {}: {error}", program.display());
-        let mut child = Command::new(program)
+        let mut command = Command::new(program);
+        if role == Role::Item {
+            // A module has little memory. Each thread of glibc would get an arena of its own.
+            command.env("MALLOC_ARENA_MAX", "1");
+        }
+        let mut child = command
             .args(arguments)
             .arg(serde_json::to_string(&part)?)
             .env("FIPA_RUNTIME_DIR", self.dir.path())

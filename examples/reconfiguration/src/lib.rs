@@ -17,12 +17,17 @@ mod fault;
 #[cfg(feature = "robots")]
 mod fetching;
 pub mod geometry;
+#[cfg(feature = "robots")]
+mod guidance;
 pub mod hardware;
 #[cfg(feature = "robots")]
 mod host;
 pub mod item;
 #[cfg(feature = "robots")]
 pub mod launch;
+mod leading;
+#[cfg(feature = "robots")]
+mod looking;
 #[cfg(feature = "robots")]
 mod operator;
 mod owning;

@@ -8,7 +8,6 @@ use fipa::protocol::ContractNet;
 use fipa::{Agent, AgentId, Domain, Message, Performative};
 
 use crate::fetching;
-use crate::geometry::Pose;
 use crate::part::{Failed, Part, Stop};
 use crate::report::{Claim, Reporter};
 use crate::sherpa::{self, Dock, DockResult};
@@ -19,8 +18,11 @@ use crate::{COALITION, Fault};
 const TIMEOUT: Duration = Duration::from_secs(20);
 /// Time between two searches.
 const PAUSE: Duration = Duration::from_millis(100);
-/// The number of attempts to dock an item.
-const ATTEMPTS: usize = 3;
+/// Maximum time after which a further attempt to dock an item begins. After a cut of the link, the guide waits up to twice
+/// [`TIMEOUT`] for its client, and refuses others until then.
+const ATTEMPTS: Duration = Duration::from_secs(45);
+/// Time between two attempts.
+const BREAK: Duration = Duration::from_secs(2);
 /// The robot that gets the stack.
 const CLIENT: &str = "crex";
 
@@ -46,16 +48,6 @@ pub(crate) async fn run(part: &Part) -> Result<(), Failed> {
     drop(operator);
     domain.close().await;
     Ok(())
-}
-
-/// Returns the pose in the description of a service.
-pub(crate) fn pose(service: &ServiceDescription) -> Option<Pose> {
-    let mut all = service.properties.iter();
-    let pose = all
-        .find(|property| property.name == "pose")?
-        .value
-        .as_ref()?;
-    serde_json::from_str(pose.as_str()?).ok()
 }
 
 struct Operator<'a> {
@@ -96,10 +88,7 @@ impl Operator<'_> {
 
     /// Waits until this number of agents has a service.
     async fn find(&self, service: &str, number: usize) -> Result<Vec<AgentDescription>, Failed> {
-        let template = AgentDescription {
-            services: vec![ServiceDescription::of_type(service)],
-            ..AgentDescription::default()
-        };
+        let template = ServiceDescription::of_type(service).into();
         loop {
             let found = self.agent.df()?.search(&template).await?;
             if found.len() >= number {
@@ -124,23 +113,17 @@ impl Operator<'_> {
         let robots: Vec<AgentId> = robots.iter().filter_map(|it| it.name.clone()).collect();
         let mut nets = Vec::new();
         for item in items {
-            let name = item
-                .name
-                .as_ref()
-                .ok_or("an item has no name")?
-                .name()
-                .to_owned();
-            let pose = item
-                .services
-                .iter()
-                .find_map(pose)
-                .ok_or("an item has no pose")?;
-            let item = name.clone();
+            let name = item.name.as_ref().ok_or("an item has no name")?.name();
+            let pose = item.services.iter().find_map(words::pose);
+            let fetch = Fetch {
+                item: name.to_owned(),
+                pose: pose.ok_or("an item has no pose")?,
+            };
             let call = self.agent.message(Performative::Cfp);
-            let call = call.content(words::say(&Fetch { item, pose }));
+            let call = call.content(words::say(&fetch));
             let net = self.agent.contract_net(call, &robots, TIMEOUT).await?;
             let bids: Bids = net.bids().proposals.iter().filter_map(bid).collect();
-            nets.push((name, net, bids));
+            nets.push((fetch.item, net, bids));
         }
         let [(first, net_1, bids_1), (second, net_2, bids_2)] = nets.as_mut_slice() else {
             return Err("expected two items".into());
@@ -206,11 +189,12 @@ impl Operator<'_> {
             client: CLIENT.to_owned(),
             with,
         };
+        let until = Instant::now() + ATTEMPTS;
         let mut attempt = 1;
         loop {
             match self.attempt(guide, &goal).await {
                 Ok(_) => return Ok(()),
-                Err(error) if attempt == ATTEMPTS || self.gives_up(item).await => {
+                Err(error) if Instant::now() >= until || self.gives_up(item).await => {
                     return Err(error);
                 }
                 Err(error) => self
@@ -218,6 +202,7 @@ impl Operator<'_> {
                     .noticed(format!("attempt {attempt} to dock {item}: {error}")),
             }
             attempt += 1;
+            tokio::time::sleep(BREAK).await;
         }
     }
 

@@ -1,10 +1,12 @@
 //! The contents of the letters: JSON.
 
 use fipa::Message;
+#[cfg(feature = "robots")]
+use fipa::platform::ServiceDescription;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::face::Face;
+use crate::face::{Contact, Face};
 #[cfg(feature = "robots")]
 use crate::geometry::{Pose, Twist};
 
@@ -29,6 +31,16 @@ pub(crate) struct Docking {
     pub(crate) client: String,
     /// The name of the merged robot.
     pub(crate) coalition: String,
+}
+
+impl Docking {
+    /// Returns the contact for which the master asks.
+    pub(crate) fn contact(&self) -> Contact {
+        Contact {
+            face: self.face.clone(),
+            other: self.with.clone(),
+        }
+    }
 }
 
 #[cfg(feature = "robots")]
@@ -60,7 +72,18 @@ pub(crate) fn say(words: &impl Serialize) -> String {
     serde_json::to_string(words).unwrap_or_default()
 }
 
+/// Returns the bytes of a content.
+pub(crate) fn bytes(message: &Message) -> &[u8] {
+    message.content().map_or(&[], |content| content)
+}
+
+#[cfg(feature = "robots")]
+/// Returns the pose that the directory lists with a service.
+pub(crate) fn pose(service: &ServiceDescription) -> Option<Pose> {
+    serde_json::from_str(service.property("pose")?.as_str()?).ok()
+}
+
 /// Reads a content.
 pub(crate) fn hear<T: DeserializeOwned>(message: &Message) -> Option<T> {
-    serde_json::from_slice(message.content()?).ok()
+    serde_json::from_slice(bytes(message)).ok()
 }

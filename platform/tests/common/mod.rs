@@ -78,10 +78,7 @@ pub(crate) fn lifting(name: &str) -> AgentDescription {
 
 /// Returns the template of all agents that lift.
 pub(crate) fn all_lifting() -> AgentDescription {
-    AgentDescription {
-        services: vec![ServiceDescription::of_type("LIFTING")],
-        ..AgentDescription::default()
-    }
+    ServiceDescription::of_type("LIFTING").into()
 }
 
 /// A directory facilitator under test.

@@ -37,7 +37,8 @@ use crate::report::Failure;
                   fipa demo dock --fault random --seed 7\n  fipa demo dock --dashboard\n  \
                   fipa demo dock --operator examples/reconfiguration/stack_operator.py\n  \
                   fipa demo dock --json | jq '.reports[] | select(.claim == \"noticed\")'\n\nJSON:\n  \
-                  { \"fault\", \"seed\", \"passed\": [checks], \"failed\": [checks with reasons],\n    \
+                  { \"fault\", \"seed\", \"steps\": { \"approach\", \"align\" }, \"seconds\" from the first award to the end of the work,\n    \
+                  \"passed\": [checks], \"failed\": [checks with reasons],\n    \
                   \"reports\": [ { \"at\" in microseconds since 1970, \"by\", \"claim\", its details } ] }"
 )]
 pub(crate) struct Arguments {
@@ -137,15 +138,23 @@ pub(super) fn run(arguments: Arguments) -> Result<(), Failure> {
         let drawn = picture::page(&outcome.reports).svg();
         std::fs::write(file, drawn).map_err(|error| not_written(file, &error))?;
     }
+    let (approach, align) = (outcome.steps("approach"), outcome.steps("align"));
     if arguments.json {
         output::json(&json!({
             "fault": fault.map_or("none", Fault::as_str),
             "seed": arguments.seed,
+            "steps": { "approach": approach, "align": align },
+            "seconds": outcome.seconds(),
             "passed": outcome.passed,
             "failed": outcome.failed,
             "reports": outcome.reports,
         }))?;
     } else {
+        if let Some(seconds) = outcome.seconds() {
+            say(&format!(
+                "{approach} steps of approach, {align} of align; {seconds:.1} s from the first award"
+            ))?;
+        }
         for check in &outcome.passed {
             say(&format!("passed: {check}"))?;
         }

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use fipa_acl::escape;
+use fipa_reconfiguration::Fault;
 use fipa_reconfiguration::launch::{self, Options};
 use fipa_reconfiguration::part::{Failed, Part};
 use fipa_reconfiguration::report::{Claim, Report, Reporter};
@@ -37,13 +38,14 @@ async fn run_part(part: &str) -> Result<bool, Failed> {
 }
 
 async fn run(arguments: &[&str]) -> Result<bool, Failed> {
+    let seed = arguments.get(1).map_or(Ok(1), |seed| seed.parse())?;
     let options = Options {
-        fault: arguments
-            .first()
-            .filter(|it| **it != "none")
-            .map(|it| it.parse())
-            .transpose()?,
-        seed: arguments.get(1).map_or(Ok(1), |seed| seed.parse())?,
+        fault: match arguments.first() {
+            None | Some(&"none") => None,
+            Some(&"random") => Some(Fault::random(seed)),
+            Some(fault) => Some(fault.parse()?),
+        },
+        seed,
         program: launch::own_program(&["part"])?,
         ..Options::default()
     };
