@@ -33,6 +33,8 @@ pub(crate) struct Stop {
     signals: Signals,
     /// Whether the command was started from a terminal.
     from_terminal: bool,
+    /// Whether a request to read the configuration again came while the command waited for a request to end.
+    has_reload: bool,
 }
 
 /// The request that a signal makes of a service.
@@ -51,11 +53,20 @@ impl Stop {
         Ok(Self {
             signals: Signals::listen()?,
             from_terminal: has_terminal(),
+            has_reload: false,
         })
     }
 
-    /// Waits for the next signal.
+    /// Waits for the next request. One to read the configuration again that came during [`requested`](Self::requested)
+    /// is the next one.
     pub(crate) async fn next_request(&mut self) -> SignalRequest {
+        match std::mem::take(&mut self.has_reload) {
+            true => SignalRequest::Reload,
+            false => self.next_signal().await,
+        }
+    }
+
+    async fn next_signal(&mut self) -> SignalRequest {
         let is_closed = |from_terminal| from_terminal && !has_terminal();
         match self.signals.next().await {
             Signal::HUP if !is_closed(self.from_terminal) => SignalRequest::Reload,
@@ -65,7 +76,9 @@ impl Stop {
 
     /// Waits for a signal that ends the command. [`join`] handles requests to read the configuration again.
     pub(crate) async fn requested(&mut self) {
-        while let SignalRequest::Reload = self.next_request().await {}
+        while let SignalRequest::Reload = self.next_signal().await {
+            self.has_reload = true;
+        }
     }
 
     /// Does work that may wait for another process, for example to join the domain. A signal ends it with an error;
@@ -76,11 +89,14 @@ impl Stop {
     ) -> Result<T, Failure> {
         tokio::select! {
             done = work => done,
-            () = self.requested() => Err(Failure::failed(
-                "canceled by a signal before the command was done",
-                "this process",
-                "run the command again",
-            )),
+            () = self.requested() => {
+                Self::ending();
+                Err(Failure::failed(
+                    "canceled by a signal before the command was done",
+                    "this process",
+                    "run the command again",
+                ))
+            }
         }
     }
 

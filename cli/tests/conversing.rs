@@ -552,6 +552,7 @@ fn a_signal_ends_a_command_that_waits_for_the_directory() {
         vec!["coalition", "pair", "arm"],
         vec!["echo", "crane"],
         vec!["listen", "crane"],
+        vec!["lock", "bay", "--", "true"],
         vec!["locks", "--watch"],
         vec!["own", "bay", "--volatile"],
         vec!["ping", "arm"],
@@ -575,8 +576,8 @@ fn a_signal_ends_a_command_that_waits_for_the_directory() {
         let mut said = String::new();
         let mut errors = child.child().stderr.take().unwrap();
         errors.read_to_string(&mut said).unwrap();
-        // `fipa locks --watch` ends with success, as always.
-        let is_ended = said.is_empty() && arguments[0] == "locks";
+        // A signal is the normal end of these.
+        let is_ended = said.is_empty() && ["locks", "up"].contains(&arguments[0]);
         let is_canceled = said.contains("canceled by a signal");
         assert!(is_ended || is_canceled, "{arguments:?}: {said}");
     }

@@ -154,7 +154,7 @@ impl PlatformAgents {
             if kind.is_host_local() {
                 continue;
             }
-            let address = format!("{}://{}", kind.name(), location.address());
+            let address = address_text(&location);
             match services.iter_mut().find(|(name, _)| name == kind.name()) {
                 Some((_, addresses)) => addresses.push(address),
                 None => services.push((kind.name().to_owned(), vec![address])),
@@ -180,19 +180,18 @@ impl PlatformAgents {
     /// Returns the entries of the directory facilitators of other gateways. An entry counts only while
     /// the directory shows its agent, at the gateway that sent the entry.
     fn remote_entries(&self) -> Vec<RemoteEntry> {
-        let is_listed = |entry: &Arc<DfEntry>| {
+        let holder = |entry: &DfEntry| {
             let is_here = |own: Arc<Entry>| own.reach == Reach::Local;
-            let holder = self.known.known(&entry.name);
-            !self.service.host.known(&entry.name).is_some_and(is_here)
-                && holder.is_some_and(|holder| {
-                    holder.incarnation == entry.incarnation
-                        && holder.mts.incarnation == entry.gateway
-                })
+            let is_local = self.service.host.known(&entry.name).is_some_and(is_here);
+            let holder = self.known.known(&entry.name).filter(|_| !is_local)?;
+            let is_listed =
+                holder.incarnation == entry.incarnation && holder.mts.incarnation == entry.gateway;
+            is_listed.then_some(holder)
         };
         let entries = self.exchange.directory().df_entries().into_iter();
-        entries
-            .filter(is_listed)
-            .map(|entry| RemoteEntry {
+        let remote = entries.filter_map(|entry| {
+            let holder = holder(&entry)?;
+            Some(RemoteEntry {
                 name: Arc::clone(&entry.name),
                 source: match entry.principal {
                     Principal::Certificate([a, b, c, d, e, f, g, h, ..]) => {
@@ -201,38 +200,21 @@ impl PlatformAgents {
                     _ => entry.gateway.as_u64(),
                 },
                 text: Arc::clone(&entry.text),
-                addresses: self.addresses_of(&entry),
+                addresses: at_hosts_of(&holder.locations, &entry.addresses),
                 ends: entry.ends,
                 has_lease: entry.has_lease,
             })
-            .collect()
+        });
+        remote.collect()
     }
 
     /// Returns the addresses at which agents of other platforms reach the agents of this host.
     fn addresses(&self) -> Vec<String> {
         let all = self.service.shown_locations().into_iter();
-        let http = all.filter(is_http);
-        let addresses = http.map(|it| format!("{}://{}", it.kind(), it.address()));
+        let http = all.filter(|it| it.kind().is_http());
+        let addresses = http.map(|it| address_text(&it));
         let fitting = addresses.filter(|it| it.len() <= Exchange::MAX_DF_ADDRESS);
         fitting.take(Exchange::MAX_DF_ADDRESSES).collect()
-    }
-
-    /// Returns the addresses at which agents of other platforms reach an agent of another host. Loopback addresses count
-    /// if the gateway of the agent is on this machine.
-    fn addresses_of(&self, entry: &DfEntry) -> Vec<String> {
-        let is_loopback = |location: &Location| match Endpoint::of(location) {
-            Some(Endpoint::Numeric(at)) => at.ip().to_canonical().is_loopback(),
-            _ => false,
-        };
-        let holder = self.known.known(&entry.name);
-        let is_near = holder.is_some_and(|it| it.locations.iter().any(is_loopback));
-        let is_valid = |address: &&String| {
-            let location = address.parse::<Location>().ok();
-            let location = location.filter(is_http);
-            location.is_some_and(|it| is_near || !is_loopback(&it))
-        };
-        let valid = entry.addresses.iter().filter(is_valid);
-        valid.cloned().collect()
     }
 
     /// Sends the entries of the directory facilitator to other gateways. Returns the agents whose
@@ -736,9 +718,6 @@ impl Task {
     }
 }
 
-/// Maximum number of addresses in an identifier of an agent of this host.
-const MAX_ADDRESSES: usize = 4;
-
 /// Returns the addresses of this gateway under which the platform at a location reaches it: those of the same kind, and
 /// of them the one on the way to the platform, if there is one.
 fn reached_at(own: &[Location], platform: &Location) -> Vec<String> {
@@ -749,7 +728,7 @@ fn reached_at(own: &[Location], platform: &Location) -> Vec<String> {
                 Some(Endpoint::Numeric(at)) => Some(at.ip().to_canonical()),
                 _ => None,
             };
-            (ip, format!("{}://{}", location.kind(), location.address()))
+            (ip, address_text(location))
         })
         .collect();
     let way = match Endpoint::of(platform) {
@@ -761,15 +740,26 @@ fn reached_at(own: &[Location], platform: &Location) -> Vec<String> {
         Some((_, address)) => vec![address.clone()],
         None => {
             let all = same.into_iter().map(|(_, address)| address);
-            all.take(MAX_ADDRESSES).collect()
+            all.take(Exchange::MAX_DF_ADDRESSES).collect()
         }
     }
 }
 
-/// Whether agents of other platforms send letters to this location.
-fn is_http(location: &Location) -> bool {
-    use fipa_transport::Kind;
-    matches!(location.kind(), Kind::Http | Kind::Https)
+/// Returns a location as agents of other platforms write it.
+fn address_text(location: &Location) -> String {
+    format!("{}://{}", location.kind(), location.address())
+}
+
+/// Returns those of the HTTP addresses that a gateway told which are at a host where it has another location: a gateway
+/// tells the addresses of its own hosts only.
+fn at_hosts_of(locations: &[Location], told: &[String]) -> Vec<String> {
+    let is_own = |address: &&String| {
+        let location = address.parse::<Location>().ok();
+        location.is_some_and(|it| {
+            it.kind().is_http() && locations.iter().any(|own| own.host() == it.host())
+        })
+    };
+    told.iter().filter(is_own).cloned().collect()
 }
 
 /// Returns the address of this host in packets to another one. Nothing is sent.
@@ -845,5 +835,25 @@ mod tests {
         let reached = reached_at(&own, &at("http://crex:7778/acc"));
         assert_eq!(reached.len(), 2);
         assert!(reached_at(&own, &at("https://127.0.0.1:443/acc")).is_empty());
+    }
+
+    #[test]
+    fn only_http_addresses_at_the_hosts_of_a_gateway_are_told() {
+        let locations = ["tcp://10.0.0.2:7788", "quic://[fd00::2]:7788"];
+        let locations: [Location; 2] = locations.map(|it| it.parse().unwrap());
+        let told = [
+            "http://10.0.0.2:7778/acc",
+            "https://[fd00::2]:7778/acc",
+            "http://10.0.0.3:7778/acc",
+            "http://127.0.0.1:7778/acc",
+            "http://0.0.0.0:7778/acc",
+            "http://localhost:7778/acc",
+            "tcp://10.0.0.2:7788",
+            "http:",
+        ];
+        let told = told.map(str::to_owned);
+        assert_eq!(at_hosts_of(&locations, &told), told[..2]);
+        let here: [Location; 1] = ["tcp://127.0.0.1:7788".parse().unwrap()];
+        assert_eq!(at_hosts_of(&here, &told), told[3..4]);
     }
 }

@@ -34,9 +34,9 @@ pub(crate) const ALIGNMENT: usize = 8;
 /// Maximum number of answers under way to all senders together.
 pub(crate) const ANSWERS: usize = 1024;
 
-/// Version of this layout and of the status page. iceoryx2 refuses other versions, because their
-/// types have other names.
-const VERSION: u32 = 7;
+/// Version of this layout and of the status page, in each parcel. A change of a type also changes its name, by which
+/// iceoryx2 refuses it.
+const VERSION: u32 = 6;
 
 /// The user header of every request.
 ///

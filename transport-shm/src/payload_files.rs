@@ -34,7 +34,7 @@ use iceoryx2_cal::shm_allocator::pool_allocator::PoolAllocator;
 use crate::storage::Storage;
 
 /// Maximum number of files of one port. The chunks of a file are at least twice as long as those of the one before. From
-/// one page to the longest letter, 2^40 bytes, that takes 29.
+/// one page to the longest letter, 2^40 bytes, that takes 29. A port that reached the limit would send nothing more.
 const MAX_FILES: usize = 40;
 
 /// Memory of payloads, in one file.

@@ -430,7 +430,7 @@ async fn watch(
     let mut stop = Stop::listen()?;
     let domain = stop.during(membership::join(config)).await?;
     let done = async {
-        let agent = asking(&domain, "df", config).await?;
+        let agent = stop.during(asking(&domain, "df", config)).await?;
         let df = server.of(&agent, config).await?;
         let notifications = df.subscribe(&template.description()).await;
         let mut notifications = notifications.map_err(|error| failed(&error, config))?;

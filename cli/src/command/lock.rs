@@ -97,7 +97,17 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 async fn lock(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
     let own_failure = |failure: Failure| failure.with_code(FAILED);
     let mut signals = Signals::listen().map_err(own_failure)?;
-    let domain = membership::join(config).await.map_err(own_failure)?;
+    let canceled = || {
+        own_failure(Failure::failed(
+            "canceled by a signal before the lock was acquired",
+            format!("resource {:?}", arguments.resource),
+            "run the command again",
+        ))
+    };
+    let domain = tokio::select! {
+        joined = membership::join(config) => joined.map_err(own_failure)?,
+        _ = signals.next() => return Err(canceled()),
+    };
     let name = match &arguments.agent {
         Some(id) => id.name().to_owned(),
         None => format!("fipa-lock-{}", Incarnation::random()),
@@ -106,17 +116,16 @@ async fn lock(arguments: &Arguments, config: &Config) -> Result<(), Failure> {
         agent_type: "fipa-lock-holder".to_owned(),
         ..RegisterOptions::default()
     };
-    let agent = membership::register(&domain, &name, options, config).await;
+    let agent = tokio::select! {
+        agent = membership::register(&domain, &name, options, config) => agent,
+        _ = signals.next() => Err(canceled()),
+    };
     let ended = match &agent {
         Err(_) => Ok(()),
         Ok(agent) => {
             let locked = tokio::select! {
                 locked = acquire(agent, arguments) => locked,
-                _ = signals.next() => Err(own_failure(Failure::failed(
-                    "canceled by a signal before the lock was acquired",
-                    format!("resource {:?}", arguments.resource),
-                    "run the command again",
-                ))),
+                _ = signals.next() => Err(canceled()),
             };
             match locked {
                 Ok(lock) => hold(&lock, arguments, &mut signals).await,

@@ -66,11 +66,15 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let (dashboard, pages) = Dashboard::start(config);
-    let opened = async {
-        let opened = Gateway::open_with_pages(config, pages).await;
-        opened.map_err(|error| membership::not_joined(error, config))
+    let opened = tokio::select! {
+        opened = Gateway::open_with_pages(config, pages) => opened,
+        // A signal is the normal end, also while the gateway waits for another process.
+        () = stop.requested() => {
+            Stop::ending();
+            return Ok(());
+        }
     };
-    let mut gateway = stop.during(opened).await?;
+    let mut gateway = opened.map_err(|error| membership::not_joined(error, config))?;
     let mut problems = gateway.discovery_problem();
     let mut problem = problems.borrow_and_update().clone();
     let mut reloads = gateway.reload_requests();

@@ -115,8 +115,12 @@ impl<'a> Guidance<'a> {
             steps,
             seconds: began.elapsed().as_secs_f64(),
         });
-        poses.cancel(TIMEOUT).await?;
-        images.cancel(TIMEOUT).await?;
+        // The item is docked, also if the link breaks now.
+        for ended in [poses.cancel(TIMEOUT).await, images.cancel(TIMEOUT).await] {
+            if let Err(error) = ended {
+                sherpa.reporter.noticed(error);
+            }
+        }
         Ok(steps)
     }
 

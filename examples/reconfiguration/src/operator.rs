@@ -18,8 +18,8 @@ use crate::{COALITION, Fault};
 const TIMEOUT: Duration = Duration::from_secs(20);
 /// Time between two searches.
 const PAUSE: Duration = Duration::from_millis(100);
-/// Maximum time after which a further attempt to dock an item begins. After a cut of the link, the guide waits up to twice
-/// [`TIMEOUT`] for its client, and refuses others until then.
+/// Maximum time after which a further attempt to dock an item begins. After a cut of the link, the guide waits twice as
+/// long as [`sherpa::TIMEOUT`](crate::sherpa::TIMEOUT) at most in the usual case, and refuses others until then.
 const ATTEMPTS: Duration = Duration::from_secs(45);
 /// Time between two attempts.
 const BREAK: Duration = Duration::from_secs(2);

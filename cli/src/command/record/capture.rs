@@ -95,7 +95,7 @@ async fn record(arguments: &Arguments, settings: Settings, config: &Config) -> R
     let path = input::name(&settings.split.path);
     let first = recording.known.changes(&watcher).unwrap_or_default();
     let recorder = Recorder::create(settings, first, Arc::clone(&recording.counts))?;
-    let topics = Topics::join(&arguments.topics, config).await?;
+    let topics = stop.during(Topics::join(&arguments.topics, config)).await?;
     // The values of topics are recorded once, and not as letters, too.
     let own = topics.as_ref().map(Topics::name);
     let recorder = recorder.without(own);
