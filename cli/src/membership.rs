@@ -89,14 +89,15 @@ impl Stop {
     ) -> Result<T, Failure> {
         tokio::select! {
             done = work => done,
-            () = self.requested() => {
+            // Before the work is dropped, which may wait, too.
+            () = async {
+                self.requested().await;
                 Self::ending();
-                Err(Failure::failed(
-                    "canceled by a signal before the command was done",
-                    "this process",
-                    "run the command again",
-                ))
-            }
+            } => Err(Failure::failed(
+                "canceled by a signal before the command was done",
+                "this process",
+                "run the command again",
+            )),
         }
     }
 
