@@ -8,6 +8,7 @@ mod support;
 use std::time::Duration;
 
 use fipa::{Agent, AgentId, Deliveries, Domain, Gateway, Message, Outcome, Performative};
+use fipa_testbed::jade;
 use support::config;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -86,17 +87,12 @@ impl Platform {
 /// Returns the length of the request at the beginning, if it is complete.
 fn request_len(bytes: &[u8]) -> Option<usize> {
     let head = bytes.windows(4).position(|it| it == b"\r\n\r\n")? + 4;
-    let text = std::str::from_utf8(&bytes[..head]).unwrap();
-    let (_, length) = text.split_once("Content-Length: ").unwrap();
-    let length: usize = length.lines().next().unwrap().parse().unwrap();
-    (bytes.len() >= head + length).then_some(head + length)
+    let end = head + jade::content_length(&bytes[..head]);
+    (bytes.len() >= end).then_some(end)
 }
 
 fn message_of(request: &[u8]) -> Message {
-    let text = std::str::from_utf8(request).unwrap();
-    let payload = text.split("\r\n\r\n").nth(3).unwrap();
-    let (payload, _) = payload.rsplit_once("\r\n--").unwrap();
-    let head = payload.to_owned().into_bytes().into();
+    let head = jade::message(request).to_vec().into();
     let payload = fipa_acl::Payload {
         head,
         ..fipa_acl::Payload::default()

@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use fipa::actions::{Action, Execution};
 use fipa::config::Sources;
 use fipa::{Config, Domain, Message, Performative};
-use fipa_testbed::{ChildGuard, Family, Host, Network, enter, ignored_test, isolated, until};
+use fipa_testbed::{ChildGuard, Family, Host, Network, enter, ignored_test, isolated, jade, until};
 use hosts::PORT;
 use serde_json::Value;
 
@@ -301,25 +301,19 @@ fn accept(mut stream: TcpStream) -> Message {
     stream.set_read_timeout(Some(TIMEOUT)).unwrap();
     let mut bytes = Vec::new();
     let mut more = [0; 65536];
-    let body = loop {
+    loop {
         let len = stream.read(&mut more).unwrap();
         assert!(len > 0, "the request is not complete");
         bytes.extend(&more[..len]);
-        let text = String::from_utf8_lossy(&bytes).into_owned();
-        let Some((head, body)) = text.split_once("\r\n\r\n") else {
-            continue;
-        };
-        let (_, length) = head.split_once("Content-Length: ").unwrap();
-        if body.len() == length.lines().next().unwrap().parse::<usize>().unwrap() {
-            break body.to_owned();
+        let head = bytes.windows(4).position(|it| it == b"\r\n\r\n");
+        if head.is_some_and(|it| bytes.len() == it + 4 + jade::content_length(&bytes[..it])) {
+            break;
         }
-    };
+    }
     let ok = b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\nConnection: close\r\n\r\n";
     stream.write_all(ok).unwrap();
-    let payload = body.split("\r\n\r\n").nth(2).unwrap();
-    let (payload, _) = payload.rsplit_once("\r\n--").unwrap();
     let payload = fipa_acl::Payload {
-        head: payload.as_bytes().to_vec().into(),
+        head: jade::message(&bytes).to_vec().into(),
         ..fipa_acl::Payload::default()
     };
     Message::decode(&payload).unwrap()
