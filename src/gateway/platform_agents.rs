@@ -723,13 +723,7 @@ impl Task {
 fn reached_at(own: &[Location], platform: &Location) -> Vec<String> {
     let same = own.iter().filter(|it| it.kind() == platform.kind());
     let same: Vec<(Option<IpAddr>, String)> = same
-        .map(|location| {
-            let ip = match Endpoint::of(location) {
-                Some(Endpoint::Numeric(at)) => Some(at.ip().to_canonical()),
-                _ => None,
-            };
-            (ip, address_text(location))
-        })
+        .map(|location| (ip_of(location), address_text(location)))
         .collect();
     let way = match Endpoint::of(platform) {
         Some(Endpoint::Numeric(at)) => local_address_to(at),
@@ -750,14 +744,29 @@ fn address_text(location: &Location) -> String {
     format!("{}://{}", location.kind(), location.address())
 }
 
+/// Whether two locations are at one host. This machine has all loopback addresses.
+fn are_at_one_host(one: &Location, other: &Location) -> bool {
+    match (ip_of(one), ip_of(other)) {
+        (Some(one), Some(other)) => one == other || one.is_loopback() && other.is_loopback(),
+        _ => one.host() == other.host(),
+    }
+}
+
+/// Returns the address of the host of a location; `None` if the location has its name.
+fn ip_of(location: &Location) -> Option<IpAddr> {
+    match Endpoint::of(location) {
+        Some(Endpoint::Numeric(at)) => Some(at.ip().to_canonical()),
+        _ => None,
+    }
+}
+
 /// Returns those of the HTTP addresses that a gateway told which are at a host where it has another location: a gateway
 /// tells the addresses of its own hosts only.
 fn at_hosts_of(locations: &[Location], told: &[String]) -> Vec<String> {
     let is_own = |address: &&String| {
         let location = address.parse::<Location>().ok();
-        location.is_some_and(|it| {
-            it.kind().is_http() && locations.iter().any(|own| own.host() == it.host())
-        })
+        let location = location.filter(|it| it.kind().is_http());
+        location.is_some_and(|it| locations.iter().any(|own| are_at_one_host(own, &it)))
     };
     told.iter().filter(is_own).cloned().collect()
 }
@@ -853,7 +862,7 @@ mod tests {
         ];
         let told = told.map(str::to_owned);
         assert_eq!(at_hosts_of(&locations, &told), told[..2]);
-        let here: [Location; 1] = ["tcp://127.0.0.1:7788".parse().unwrap()];
+        let here: [Location; 1] = ["tcp://127.0.0.2:7788".parse().unwrap()];
         assert_eq!(at_hosts_of(&here, &told), told[3..4]);
     }
 }
