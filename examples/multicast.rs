@@ -34,7 +34,8 @@ async fn main() -> fipa::Result<()> {
 
     // A coalition exists until it is dropped. With a leader, only the leader receives.
     let names = ["arm_1", "arm_3"];
-    let left = domain.form("left_side", names, None, RegisterOptions::default())?;
+    let left = domain.form("left_side", names, None, RegisterOptions::default());
+    let left = left.await?;
     let lift = rover.message(Inform).receiver(left.name()).content("lift");
     println!("{}", rover.send(lift).await?);
 

@@ -42,12 +42,12 @@ impl Host {
         }
     }
 
-    fn form(&self, name: &str, members: &[&str], leader: Option<&str>) -> Coalition {
+    async fn form(&self, name: &str, members: &[&str], leader: Option<&str>) -> Coalition {
         let options = RegisterOptions::default();
         let formed = self
             .domain
             .form(name, members.iter().copied(), leader, options);
-        formed.unwrap()
+        formed.await.unwrap()
     }
 
     async fn until_known(&self, names: &[&str]) {
@@ -85,7 +85,7 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     let rover = near.domain.register("rover").await.unwrap();
     let arm = far.domain.register("arm").await.unwrap();
     let camera = far.domain.register("camera").await.unwrap();
-    let mut team = near.form("team", &["rover", "arm", "camera"], None);
+    let mut team = near.form("team", &["rover", "arm", "camera"], None).await;
     far.until_known(&["team", "rover"]).await;
     near.until_known(&["arm", "camera"]).await;
 
@@ -142,29 +142,37 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
 #[tokio::test(flavor = "multi_thread")]
 async fn refused_changes_leave_a_coalition_as_it_was() {
     let host = Host::start(None).await;
-    let mut team = host.form("team", &["a", "b"], Some("b"));
+    let mut team = host.form("team", &["a", "b"], Some("b")).await;
     let options = RegisterOptions::default;
-    let form = |name: &str, members: &[&str]| {
+    let form = async |name: &str, members: &[&str]| {
         host.domain
             .form(name, members.iter().copied(), None, options())
+            .await
     };
     assert!(matches!(
-        form("team", &["a"]),
+        form("team", &["a"]).await,
         Err(CoalitionError::Register(_))
     ));
-    assert!(matches!(form("x", &[]), Err(CoalitionError::Members(_))));
+    assert!(matches!(
+        form("x", &[]).await,
+        Err(CoalitionError::Members(_))
+    ));
     let stranger = team.split("other", &["c"], None, options());
     assert!(matches!(stranger, Err(CoalitionError::NoMember(name)) if name == "c"));
     assert!(team.split("other", &["a", "b"], None, options()).is_err());
-    let taken = form("taken", &["z"]).unwrap();
+    let taken = form("taken", &["z"]).await.unwrap();
     assert!(team.split("taken", &["a"], None, options()).is_err());
     let many: Vec<String> = (0..Members::MAX_MEMBERS).map(|n| n.to_string()).collect();
-    let many = host.domain.form("many", many, None, options()).unwrap();
+    let many = host
+        .domain
+        .form("many", many, None, options())
+        .await
+        .unwrap();
     let (error, many) = *team.merge(many).unwrap_err();
     assert!(matches!(error, CoalitionError::Members(_)));
     // A coalition of another domain cannot be merged.
     let elsewhere = Host::start(None).await;
-    let foreign = elsewhere.form("foreign", &["q"], None);
+    let foreign = elsewhere.form("foreign", &["q"], None).await;
     let (error, foreign) = *team.merge(foreign).unwrap_err();
     assert!(matches!(error, CoalitionError::Register(_)), "{error}");
     let names: Vec<String> = team
@@ -246,7 +254,7 @@ async fn a_merger_or_split_is_atomic_for_watchers() {
     let near = Host::start(None).await;
     let far = Host::start(Some(&near)).await;
     let modules = ["m0", "m1", "m2", "m3", "m4", "m5"];
-    let mut whole = near.form("whole", &modules, Some("m0"));
+    let mut whole = near.form("whole", &modules, Some("m0")).await;
     far.until_known(&["whole"]).await;
     let over = Arc::new(AtomicBool::new(false));
     let beside = Domain::open(&near.config).await.unwrap();

@@ -181,6 +181,7 @@ async fn agents_are_listed_by_type_and_their_changes_are_a_stream() {
     ];
     let group = there
         .form("group", ["arm_1"], None, of_type("arm"))
+        .await
         .unwrap();
     let names = |found: Vec<std::sync::Arc<fipa::Entry>>| {
         let names: Vec<String> = found.iter().map(|it| it.name.to_string()).collect();

@@ -8,10 +8,11 @@ mod support;
 use std::fs::{File, TryLockError};
 use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
+use std::pin::Pin;
 use std::task::Poll;
 
 use fipa::error::RegisterError;
-use fipa::{Change, Config, Domain};
+use fipa::{Change, Config, Domain, RegisterOptions};
 
 /// Makes a configuration for a domain that no other test uses.
 fn config() -> Config {
@@ -41,7 +42,7 @@ fn lock(config: &Config) -> File {
 /// Polls a future once, and then waits until a thread of this process waits for the domain's lock.
 async fn begin<F: Future + Unpin>(future: &mut F, config: &Config) {
     let polled = std::future::poll_fn(|context| {
-        let polled = std::pin::Pin::new(&mut *future).poll(context);
+        let polled = Pin::new(&mut *future).poll(context);
         Poll::Ready(polled.is_pending())
     });
     assert!(polled.await, "the lock is held");
@@ -87,12 +88,33 @@ async fn a_gateway_that_waits_to_join_holds_up_no_task() {
 
 #[tokio::test]
 async fn a_dropped_registration_leaves_no_name() {
+    dropped_leaves_no_name(|domain| {
+        Box::pin(async { drop(domain.register("arm").await.unwrap()) })
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn a_dropped_coalition_leaves_no_name() {
+    dropped_leaves_no_name(|domain| {
+        Box::pin(async {
+            let options = RegisterOptions::default();
+            drop(domain.form("arm", ["leg"], None, options).await.unwrap());
+        })
+    })
+    .await;
+}
+
+/// Drops the registration of the name `arm` before it has begun, and while it waits.
+async fn dropped_leaves_no_name(
+    register: impl Fn(&Domain) -> Pin<Box<dyn Future<Output = ()> + '_>>,
+) {
     let config = config();
     let domain = Domain::open(&config).await.unwrap();
     let mut watch = domain.directory().watch();
     for has_begun in [false, true] {
         let held = lock(&config);
-        let mut registration = Box::pin(domain.register("arm"));
+        let mut registration = register(&domain);
         if has_begun {
             begin(&mut registration, &config).await;
         }
@@ -109,8 +131,7 @@ async fn a_dropped_registration_leaves_no_name() {
         }
         drop(leg);
     }
-    let arm = domain.register("arm").await.unwrap();
-    assert_eq!(arm.name(), "arm");
+    register(&domain).await;
 }
 
 #[cfg(feature = "net")]

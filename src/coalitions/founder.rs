@@ -98,10 +98,10 @@ impl LedCoalition {
         let members = Members::vacant(names).map_err(CoalitionError::from)?;
         let lock = Owned::begin(Arc::clone(core), lock_of(name)?, options.lock).await?;
         let (domain, name) = (core.endpoint.domain.clone(), name.to_owned());
-        let formed = blocking(runtime_of(core), move || {
-            domain.form_of(&name, members, options.listing)
+        let formed = background::run(runtime_of(core), move |cancellation| {
+            domain.form_unless(&name, members, options.listing, cancellation)
         });
-        let formed = formed.await?;
+        let formed = formed.await??;
         Ok(Self::start(core, formed, lock))
     }
 

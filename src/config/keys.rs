@@ -94,17 +94,6 @@ const ACCESS: &str = r#"a list of receivers such as ["arm_.* performative=reques
 const PLATFORM_AGENT: &str = r#"true, false or a name such as "directory""#;
 const ADDRESSES: &str = r#"a list of numeric addresses with port such as ["127.0.0.1:0"]"#;
 
-/// Former names of keys, which are read as well.
-const ALIASES: &[(&[&str], &[&str])] =
-    &[(&["security", "old_peers"], &["security", "legacy_peers"])];
-
-/// Replaces the former name of a key by its present one.
-pub(super) fn present_name(path: &mut Vec<String>) {
-    if let Some((_, present)) = ALIASES.iter().find(|(former, _)| path == former) {
-        *path = present.iter().map(|part| (*part).to_owned()).collect();
-    }
-}
-
 /// Every key, in the order in which `fipa config show` prints them, before the [`MAPS`].
 pub(super) const KEYS: &[Key] = &[
     Key {

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use toml_edit::{Array, Document, Item, Value as Toml};
 
-use super::keys::{InvalidValue, KEYS, Key, MAPS, Map, Shape, dotted, present_name};
+use super::keys::{InvalidValue, KEYS, Key, MAPS, Map, Shape, dotted};
 use super::{Config, Mistake, Origin, check};
 
 /// A configuration that is being read.
@@ -55,7 +55,7 @@ impl Reader {
     /// and a list needs no brackets.
     pub(super) fn set(&mut self, assignment: &str) {
         let layer = Layer::Set(assignment);
-        let Some((mut path, raw)) = split(assignment) else {
+        let Some((path, raw)) = split(assignment) else {
             self.mistake(
                 layer.origin(None),
                 "not of the form key=value".to_owned(),
@@ -63,7 +63,6 @@ impl Reader {
             );
             return;
         };
-        present_name(&mut path);
         let parts: Vec<&str> = path.iter().map(String::as_str).collect();
         let shape = match Node::at(&parts) {
             Node::Key(key) => Some(key.shape),
@@ -134,7 +133,6 @@ impl Reader {
         span: Option<Range<usize>>,
         item: &Item,
     ) {
-        present_name(&mut path);
         let parts: Vec<&str> = path.iter().map(String::as_str).collect();
         match Node::at(&parts) {
             Node::Section => self.table(layer, &mut path, item),

@@ -4,11 +4,12 @@ use std::sync::Arc;
 
 use fipa_acl::ErrorChain;
 use fipa_sds::{
-    DeregisterError, Directory, Members, MembersError, RegisterError, Registration, Role,
+    Cancellation, DeregisterError, Directory, Members, MembersError, RegisterError, Registration,
+    Role,
 };
 use fipa_transport::{Incarnation, log_limit};
 
-use crate::domain::{Domain, warn_of_name};
+use crate::domain::{Domain, background, warn_of_name};
 use crate::{AgentId, RegisterOptions};
 
 /// One name for several agents on any hosts. If the coalition has a leader, a message to it reaches
@@ -29,10 +30,13 @@ pub struct Coalition {
 impl Domain {
     /// Forms a coalition of these agents.
     ///
+    /// Waits like [`register_with`](Self::register_with). Dropping the future ends the wait, and no
+    /// coalition is formed.
+    ///
     /// # Errors
     /// If the name is invalid or taken, if the members or the leader are invalid, or if the directory
     /// cannot be written.
-    pub fn form<N: Into<Arc<str>>>(
+    pub async fn form<N: Into<Arc<str>>>(
         &self,
         name: &str,
         members: impl IntoIterator<Item = N>,
@@ -40,17 +44,24 @@ impl Domain {
         options: RegisterOptions,
     ) -> Result<Coalition, CoalitionError> {
         let members = Members::new(members, leader.map(Into::into))?;
-        self.form_of(name, members, options)
+        let (domain, name) = (self.clone(), name.to_owned());
+        let formed = background::run(&self.inner.service.runtime, move |cancellation| {
+            domain.form_unless(&name, members, options, cancellation)
+        });
+        formed.await.map_err(RegisterError::from)?
     }
 
-    pub(crate) fn form_of(
+    /// Forms a coalition on the calling thread.
+    pub(crate) fn form_unless(
         &self,
         name: &str,
         members: Members,
         options: RegisterOptions,
+        cancellation: &Cancellation,
     ) -> Result<Coalition, CoalitionError> {
         let registration = registration_of(name, &members, options);
-        self.inner.service.host.register(registration.clone())?;
+        let host = &self.inner.service.host;
+        host.register_unless(registration.clone(), cancellation)?;
         if let Ok(id) = AgentId::new(name) {
             warn_of_name(&id);
         }

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use fipa_acl::{ErrorChain, Message};
 use fipa_locking::{Algorithm, Ending, Fence, Grant, Options, OwnerState, Resource};
-use fipa_sds::{Entry, RegisterError, Role};
+use fipa_sds::{Cancellation, Entry, Members, RegisterError, Role};
 use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
 
@@ -173,8 +173,8 @@ impl Owned {
         let agent = Arc::clone(&owned.core);
         let service = &owned.core.endpoint.domain.inner.service;
         let algorithm = owned.shared.read(|locks, _| locks.own_algorithm());
-        let prepared = background::run(&service.runtime, move |_| {
-            prepare(&agent, &resource, &options, algorithm)
+        let prepared = background::run(&service.runtime, move |cancellation| {
+            prepare(&agent, &resource, &options, algorithm, cancellation)
         });
         let files = prepared.await.map_err(LockError::from)??;
         let life = files.life;
@@ -311,6 +311,7 @@ fn prepare(
     resource: &Resource,
     options: &OwnOptions,
     algorithm: Algorithm,
+    cancellation: &Cancellation,
 ) -> Result<Files, OwnError> {
     let domain = &core.endpoint.domain;
     let lease = clock::millis(options.lease);
@@ -344,7 +345,11 @@ fn prepare(
         description: algorithm.protocol().to_owned(),
     };
     let owner = Arc::clone(&core.endpoint.name);
-    let listed = match domain.form(&entry_name(resource), [owner], None, listing) {
+    let members = Members::new([owner], None).map_err(CoalitionError::from);
+    let listed = members.and_then(|members| {
+        domain.form_unless(&entry_name(resource), members, listing, cancellation)
+    });
+    let listed = match listed {
         Ok(listed) => Some(listed),
         Err(CoalitionError::Register(RegisterError::AlreadyRegistered { holder })) => {
             let owner = listed_members(&holder).unwrap_or(&holder.name);

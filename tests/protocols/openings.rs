@@ -40,9 +40,13 @@ async fn a_contract_net_reaches_the_members_of_patterns_and_coalitions_once() {
     ];
     let members = ["rover", "arm_1", "leg", "lost"];
     let options = RegisterOptions::default;
-    let _platoon = here.form("platoon", members, None, options()).unwrap();
+    let _platoon = here
+        .form("platoon", members, None, options())
+        .await
+        .unwrap();
     let _led = here
         .form("led", ["arm_1", "leg"], Some("leg"), options())
+        .await
         .unwrap();
     let rounds: [(&[&str], &[&str], &[&str]); 4] = [
         (&["platoon"], &["arm_1", "leg"], &["lost"]),
@@ -102,6 +106,7 @@ async fn an_auction_reaches_the_members_of_a_coalition() {
     let options = RegisterOptions::default();
     let _platoon = here
         .form("platoon", ["arm_1", "arm_2"], None, options)
+        .await
         .unwrap();
     let bidder = async |arm: &Agent| {
         let opening = next_message(arm).await.unwrap();
@@ -137,8 +142,11 @@ async fn the_bidders_of_an_auction_are_the_agents_that_its_receivers_stand_for()
     ];
     let both = ["arm_1", "arm_2"];
     let options = RegisterOptions::default;
-    let _platoon = here.form("platoon", both, None, options()).unwrap();
-    let _led = here.form("led", both, Some("arm_2"), options()).unwrap();
+    let _platoon = here.form("platoon", both, None, options()).await.unwrap();
+    let _led = here
+        .form("led", both, Some("arm_2"), options())
+        .await
+        .unwrap();
     let one = ["arm_2"];
     for (receivers, bidders) in [
         (&["platoon"][..], &both[..]),
@@ -173,8 +181,11 @@ async fn a_request_needs_receivers_that_stand_for_one_agent() {
     ];
     let both = ["arm_1", "arm_2"];
     let options = RegisterOptions::default;
-    let _platoon = here.form("platoon", both, None, options()).unwrap();
-    let _led = here.form("led", both, Some("arm_2"), options()).unwrap();
+    let _platoon = here.form("platoon", both, None, options()).await.unwrap();
+    let _led = here
+        .form("led", both, Some("arm_2"), options())
+        .await
+        .unwrap();
     for several in ["platoon", "arm_.*"] {
         let to = |act| rover.message(act).receivers(ids(&[several]));
         let refused = [

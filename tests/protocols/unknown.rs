@@ -119,8 +119,14 @@ async fn members_of_coalitions_and_patterns_answer_a_call_of_an_enforcing_agent(
     let arms = registered(&there, ["arm_1", "arm_2"]).await;
     let options = RegisterOptions::default;
     let members = ["rover", "arm_1", "arm_2"];
-    let _platoon = here.form("platoon", members, None, options()).unwrap();
-    let _led = here.form("led", members, Some("arm_2"), options()).unwrap();
+    let _platoon = here
+        .form("platoon", members, None, options())
+        .await
+        .unwrap();
+    let _led = here
+        .form("led", members, Some("arm_2"), options())
+        .await
+        .unwrap();
     let calls: [(&[&str], usize); 4] = [
         (&["platoon"], 2),
         (&["led"], 1),

@@ -2,7 +2,7 @@
 
 use clap::Args;
 use fipa::error::{CoalitionError, ErrorChain};
-use fipa::{AgentId, Domain, RegisterOptions};
+use fipa::{AgentId, Coalition, Config, Domain, RegisterOptions};
 use fipa_acl::escape;
 
 use crate::complete;
@@ -51,16 +51,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     options::block_on(async {
         let mut stop = Stop::listen()?;
         let domain = stop.during(membership::join(&config)).await?;
-        let formed = form(&domain, &arguments).map_err(|error| match error {
-            CoalitionError::Register(error) => {
-                membership::not_registered(error, arguments.name.name(), &config)
-            }
-            other => Failure::wrong_usage(
-                ErrorChain(&other).to_string(),
-                "the command line",
-                "change the members or the leader",
-            ),
-        });
+        let formed = stop.during(form(&domain, &arguments, &config)).await;
         let done = match formed {
             Ok(coalition) => {
                 let members = match coalition.members().names().len() {
@@ -83,12 +74,25 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     })?
 }
 
-fn form(domain: &Domain, arguments: &Arguments) -> Result<fipa::Coalition, CoalitionError> {
+async fn form(
+    domain: &Domain,
+    arguments: &Arguments,
+    config: &Config,
+) -> Result<Coalition, Failure> {
     let options = RegisterOptions {
         agent_type: arguments.agent_type.clone(),
         description: arguments.description.clone(),
     };
+    let name = arguments.name.name();
     let members = arguments.members.iter().map(AgentId::name);
     let leader = arguments.leader.as_ref().map(AgentId::name);
-    domain.form(arguments.name.name(), members, leader, options)
+    let formed = domain.form(name, members, leader, options).await;
+    formed.map_err(|error| match error {
+        CoalitionError::Register(error) => membership::not_registered(error, name, config),
+        other => Failure::wrong_usage(
+            ErrorChain(&other).to_string(),
+            "the command line",
+            "change the members or the leader",
+        ),
+    })
 }

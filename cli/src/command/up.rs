@@ -79,7 +79,15 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
     let mut problem = problems.borrow_and_update().clone();
     let mut reloads = gateway.reload_requests();
     // Letters do not depend on the recorder.
-    let recorder = RecorderService::start(config, gateway.name()).await;
+    let recorder = tokio::select! {
+        recorder = RecorderService::start(config, gateway.name()) => recorder,
+        () = stop.requested() => {
+            Stop::ending();
+            dashboard.close().await;
+            gateway.close().await;
+            return Ok(());
+        }
+    };
     let recorder = recorder.unwrap_or_else(|failure| {
         report::warn(&format!("no recorder runs: {}", failure.problem()));
         None

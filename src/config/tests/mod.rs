@@ -36,19 +36,6 @@ fn error(text: &str, set: &[&str]) -> String {
 }
 
 #[test]
-fn the_former_name_of_a_key_is_read_as_the_present_one() {
-    let addresses: [std::net::IpAddr; 1] = ["10.0.0.9".parse().unwrap()];
-    for (text, set) in [
-        ("[security]\nold_peers = [\"10.0.0.9\"]\n", &[][..]),
-        ("", &["security.old_peers=10.0.0.9"][..]),
-        ("", &["security.legacy_peers=10.0.0.9"][..]),
-    ] {
-        let config = config(text, set);
-        assert_eq!(config.security.legacy_peers, addresses, "{text:?} {set:?}");
-    }
-}
-
-#[test]
 fn an_empty_configuration_yields_the_defaults() {
     let sources = Sources {
         host_name: "sherpa".to_owned(),
