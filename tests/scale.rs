@@ -15,7 +15,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa::{Config, Domain, Entry, Incarnation, Location, Matcher, Query, Reach, Role, Source};
 use fipa_sds::{HostConfig, HostDirectory, MtsId};
-use fipa_testbed::{ChildGuard, ignored_test};
+use fipa_testbed::{ChildGuard, ignored_test, private_memory};
 
 const AGENTS: usize = 1000;
 
@@ -65,21 +65,6 @@ async fn a_process_of_its_own() {
     waiting.await.unwrap().unwrap();
     drop(agents);
     domain.close().await;
-}
-
-/// Returns the private anonymous memory of a process, in bytes.
-fn private_memory(pid: u32) -> u64 {
-    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
-    let line = status
-        .lines()
-        .find_map(|line| line.strip_prefix("RssAnon:"));
-    let kib: u64 = line
-        .unwrap()
-        .trim()
-        .trim_end_matches(" kB")
-        .parse()
-        .unwrap();
-    kib << 10
 }
 
 /// Returns the processor time that a process has used so far.

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use fipa_testbed::{ChildGuard, ignored_test};
+use fipa_testbed::{ChildGuard, ignored_test, private_memory};
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::process::{ROLE, Role};
@@ -524,21 +524,8 @@ impl Cluster {
 
     /// Memory of the survivors that is not shared, in bytes.
     fn private_memory(&self) -> u64 {
-        let of = |process: &TestProcess| {
-            let status =
-                std::fs::read_to_string(format!("/proc/{}/status", process.pid())).unwrap();
-            let line = status
-                .lines()
-                .find_map(|line| line.strip_prefix("RssAnon:"));
-            let kib: u64 = line
-                .unwrap()
-                .trim()
-                .trim_end_matches(" kB")
-                .parse()
-                .unwrap();
-            kib << 10
-        };
-        self.survivors().map(of).sum()
+        let survivors = self.survivors();
+        survivors.map(|it| private_memory(it.pid())).sum()
     }
 
     /// All files of the domain.

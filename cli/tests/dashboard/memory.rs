@@ -1,6 +1,7 @@
 //! The memory that pages which never read cost.
 
 use fipa::{AgentId, Performative};
+use fipa_testbed::private_memory;
 
 use super::*;
 
@@ -9,23 +10,13 @@ const LETTERS: usize = 6000;
 
 /// Bound of the growth of the gateway's own memory with all silent pages, in bytes. Measured: 5 to 19 MB, most of it the
 /// drift of the allocator.
-const MAX_MEMORY: usize = 64 << 20;
+const MAX_MEMORY: u64 = 64 << 20;
 
 /// Growth of the gateway with that many letters once its tables are full, in bytes.
-const MAX_DRIFT: usize = 4 << 20;
+const MAX_DRIFT: u64 = 4 << 20;
 
 /// Bound of the data that the system keeps for a silent page, in bytes. Measured: 286 KB.
 const MAX_KEPT: usize = 512 << 10;
-
-/// The memory of a process that is in no file, in bytes.
-fn memory(pid: &str) -> usize {
-    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
-    let line = status
-        .lines()
-        .find_map(|line| line.strip_prefix("RssAnon:"));
-    let kib = line.unwrap().trim().trim_end_matches(" kB");
-    kib.parse::<usize>().unwrap() << 10
-}
 
 /// The bytes that the system keeps for the clients of a port, which have not taken them.
 fn kept_by_system(port: u16) -> Vec<usize> {
@@ -72,11 +63,11 @@ fn pages_that_never_read_cost_bounded_memory() {
         send(10);
         newest() >= 200
     });
-    let pid = shown.gateway.pid();
+    let pid: u32 = shown.gateway.pid().parse().unwrap();
     let mut before = 0;
     until("the gateway does not grow any more", || {
         send(LETTERS);
-        let earlier = std::mem::replace(&mut before, memory(&pid));
+        let earlier = std::mem::replace(&mut before, private_memory(pid));
         before < earlier + MAX_DRIFT
     });
 
@@ -93,7 +84,7 @@ fn pages_that_never_read_cost_bounded_memory() {
         is_full
     });
     send(LETTERS);
-    let grown = memory(&pid).saturating_sub(before);
+    let grown = private_memory(pid).saturating_sub(before);
     let most = all.iter().max().copied().unwrap();
     println!(
         "{MAX_STREAMS} silent pages: {grown} bytes of the gateway, up to {most} of the system each"

@@ -33,6 +33,19 @@ pub fn send_signal(process: u32, signal: &str) {
     }
 }
 
+/// Returns the memory of a process that is in no file, in bytes.
+///
+/// # Panics
+/// If there is no such process.
+#[must_use]
+#[track_caller]
+pub fn private_memory(process: u32) -> u64 {
+    let status = fs::read_to_string(format!("/proc/{process}/status")).unwrap();
+    let mut lines = status.lines();
+    let kib = lines.find_map(|line| line.strip_prefix("RssAnon:")?.strip_suffix(" kB"));
+    kib.unwrap().trim().parse::<u64>().unwrap() << 10
+}
+
 /// Whether no thread of the process runs.
 fn is_stopped(process: u32) -> bool {
     let Ok(threads) = fs::read_dir(format!("/proc/{process}/task")) else {
