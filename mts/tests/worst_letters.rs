@@ -6,8 +6,8 @@
 #![expect(clippy::print_stdout, reason = "it prints the time")]
 
 use std::net::{IpAddr, Ipv4Addr};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
@@ -63,9 +63,11 @@ fn core_with(agents: u64) -> (Core, Arc<dyn Directory>) {
     (Core::new(config, directory.view()), directory)
 }
 
+/// The time of everything that happens without another time, however long the test takes.
 fn now() -> Now {
+    static BEGIN: LazyLock<Instant> = LazyLock::new(Instant::now);
     Now {
-        instant: Instant::now(),
+        instant: *BEGIN,
         utc: SystemTime::UNIX_EPOCH + Duration::from_secs(1 << 30),
     }
 }
