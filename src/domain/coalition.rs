@@ -19,7 +19,8 @@ use crate::{AgentId, RegisterOptions};
 /// is not registered fails like an unknown name. A member may be a coalition itself, up to four
 /// levels deep.
 ///
-/// This process owns the coalition. Dropping it removes the name from the directory.
+/// This process owns the coalition. Dropping it removes the name from the directory. Methods that change
+/// the directory block the thread while another process changes it, up to a minute.
 pub struct Coalition {
     domain: Domain,
     registration: Registration,
