@@ -265,6 +265,15 @@ fn hosts_without_keys_are_told_to_make_them() {
 }
 
 #[test]
+fn a_command_run_with_sudo_names_the_next_one_with_sudo() {
+    let host = Host::new();
+    let mut init = host.command(&["keys", "init", "--dir", "keys"]);
+    let made = init.env("SUDO_USER", "robot").output().unwrap();
+    let said = String::from_utf8(made.stdout).unwrap();
+    assert!(said.contains("run `sudo fipa keys pair`,"), "{said}");
+}
+
+#[test]
 fn a_pattern_that_stands_for_no_agent_is_refused() {
     let host = Host::new();
     let dir = host.path("keys").display().to_string();

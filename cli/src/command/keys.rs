@@ -181,9 +181,10 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             let certificate = certificate.map_err(|error| failed(&error, &keys))?;
             output::text(&format!(
                 "created a key and a certificate for {}\n{}\
-                 to pair it with another host, run `fipa keys pair`, or give {} to the owner of that host\n{}",
+                 to pair it with another host, run `{}`, or give {} to the owner of that host\n{}",
                 escape(certificate.certified().mts()),
                 described(&certificate),
+                pairing_command(),
                 keys.own_file().display(),
                 to_configure(&keys, &config.security.keys),
             ))
@@ -290,17 +291,26 @@ fn wait_for_pair(port: u16, keys: &Keys) -> Result<(), Failure> {
     finish_pair(&paired, keys)
 }
 
+/// The command that pairs this host or, on the other host, follows this one.
+fn pairing_command() -> &'static str {
+    match std::env::var_os("SUDO_USER") {
+        Some(_) => "sudo fipa keys pair",
+        None => "fipa keys pair",
+    }
+}
+
 /// Tells what to type on the other host.
 fn invitation(listener: &Listener) -> String {
+    let command = pairing_command();
     let commands: Vec<_> = match listener.addresses() {
         Ok(addresses) => addresses
             .iter()
             .take(SHOWN_ADDRESSES)
-            .map(|address| format!("  fipa keys pair {address}\n"))
+            .map(|address| format!("  {command} {address}\n"))
             .collect(),
         Err(error) => {
             report::warn(&ErrorChain(&error).to_string());
-            vec![format!("  fipa keys pair HOST:{}\n", listener.port())]
+            vec![format!("  {command} HOST:{}\n", listener.port())]
         }
     };
     format!(
