@@ -23,8 +23,8 @@ use crate::admin::keys::KeysError;
 use crate::admin::pairing::{CodeError, PairingError};
 use crate::admin::routes::AskError;
 use crate::config::{ConfigError, RuleError};
-use crate::domain::coalition::CoalitionError;
 use crate::domain::files::DomainDirError;
+use crate::error::CoalitionError;
 #[cfg(feature = "protocols")]
 use crate::error::ProtocolError;
 use crate::error::{OpenError, ReceiveError, SendError};

@@ -29,7 +29,6 @@ use crate::Config;
 #[cfg(feature = "secure")]
 use crate::admin::keys::KeysError;
 use crate::config::{ConfigError, RuleError};
-pub use crate::domain::coalition::CoalitionError;
 use crate::domain::files::DomainDir;
 pub use crate::domain::files::DomainDirError;
 #[cfg(feature = "web")]
@@ -219,4 +218,22 @@ pub enum ProtocolError {
     /// The files define too many protocols.
     #[error("monitor.protocols: too many protocols")]
     Full(#[from] LibraryFull),
+}
+
+/// The error of forming or changing a coalition.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CoalitionError {
+    /// The members or the leader are invalid.
+    #[error(transparent)]
+    Members(#[from] MembersError),
+    /// An agent to be split off is not a member. Holds its name.
+    #[error("{0:?} is not a member of this coalition")]
+    NoMember(String),
+    /// The directory refuses the coalition.
+    #[error(transparent)]
+    Register(#[from] RegisterError),
+    /// The name cannot be removed from the directory.
+    #[error(transparent)]
+    Deregister(#[from] DeregisterError),
 }

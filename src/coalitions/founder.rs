@@ -15,7 +15,8 @@ use super::lock_of;
 use crate::RegisterOptions;
 use crate::agent::AgentCore;
 use crate::domain::background::{self, BackgroundError};
-use crate::domain::coalition::{Coalition, CoalitionError};
+use crate::domain::coalition::Coalition;
+use crate::error::CoalitionError;
 use crate::locks::{AdmitError, OwnError, OwnOptions, Owned};
 
 /// The options of [`Agent::found_coalition`](crate::Agent::found_coalition).

@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use fipa_acl::ErrorChain;
 use fipa_sds::{
-    Cancellation, DeregisterError, Directory, Members, MembersError, RegisterError, Registration,
-    Role,
+    Cancellation, DeregisterError, Directory, Members, RegisterError, Registration, Role,
 };
 use fipa_transport::{Incarnation, log_limit};
 
 use crate::domain::{Domain, background, warn_of_name};
+use crate::error::CoalitionError;
 use crate::{AgentId, RegisterOptions};
 
 /// One name for several agents on any hosts. If the coalition has a leader, a message to it reaches
@@ -260,22 +260,4 @@ impl std::fmt::Debug for Coalition {
             .field("members", &self.members)
             .finish_non_exhaustive()
     }
-}
-
-/// The error of forming or changing a coalition.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum CoalitionError {
-    /// The members or the leader are invalid.
-    #[error(transparent)]
-    Members(#[from] MembersError),
-    /// An agent to be split off is not a member. Holds its name.
-    #[error("{0:?} is not a member of this coalition")]
-    NoMember(String),
-    /// The directory refuses the coalition.
-    #[error(transparent)]
-    Register(#[from] RegisterError),
-    /// The name cannot be removed from the directory.
-    #[error(transparent)]
-    Deregister(#[from] DeregisterError),
 }

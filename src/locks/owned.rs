@@ -16,7 +16,7 @@ use super::state_file::StateFile;
 use super::{AdmitError, LockError, OwnError, ResourceStatus, clock, message};
 use crate::agent::AgentCore;
 use crate::domain::background;
-use crate::domain::coalition::CoalitionError;
+use crate::error::CoalitionError;
 use crate::{Coalition, DirectoryView, RegisterOptions};
 
 /// Type of the directory's entry of an owned resource.
