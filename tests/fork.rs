@@ -12,8 +12,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use fipa::blocking::Wait;
-use fipa::error::{Forked, ReceiveError, RegisterError, SendError};
-use fipa::{Agent, AgentId, Config, Domain, Incoming, Message, Performative};
+use fipa::error::{CoalitionError, Forked, ReceiveError, RegisterError, SendError};
+use fipa::{Agent, AgentId, Config, Domain, Incoming, Message, Performative, RegisterOptions};
 use fork::{Fork, fork, waitpid};
 
 /// Content that is large enough to be read in the sender's memory.
@@ -124,6 +124,9 @@ fn parent_of_a_child_that_drops() {
             let received = arm.receive().wait();
             let waited = arm.receive_within(Duration::from_millis(1)).wait();
             let registered = here.register("foot").wait();
+            let formed = here
+                .form("pair", ["arm"], None, RegisterOptions::default())
+                .wait();
             let parent = std::os::unix::process::parent_id();
             let refused = Forked { owner: parent };
             let checks = [
@@ -137,6 +140,13 @@ fn parent_of_a_child_that_drops() {
                 (
                     "register",
                     matches!(registered, Err(RegisterError::Forked(_))),
+                ),
+                (
+                    "form",
+                    matches!(
+                        formed,
+                        Err(CoalitionError::Register(RegisterError::Forked(_)))
+                    ),
                 ),
                 ("content", is_whole(&held)),
             ];

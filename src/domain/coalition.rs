@@ -44,6 +44,7 @@ impl Domain {
         leader: Option<&str>,
         options: RegisterOptions,
     ) -> Result<Coalition, CoalitionError> {
+        self.inner.owner.check().map_err(RegisterError::from)?;
         let members = Members::new(members, leader.map(Into::into))?;
         let (domain, name) = (self.clone(), name.to_owned());
         let formed = background::run(&self.inner.service.runtime, move |cancellation| {
