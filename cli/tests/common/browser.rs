@@ -11,6 +11,9 @@ use serde_json::{Value, json};
 /// Timeout for hanging tests.
 const WATCHDOG: Duration = Duration::from_secs(60);
 
+/// Maximum number of starts of the driver. It takes a free port of IPv4, and ends if that port of IPv6 is taken.
+const MOST_STARTS: usize = 5;
+
 /// A window of a browser. Ends with it.
 pub(crate) struct Browser {
     _driver: ChildGuard,
@@ -23,27 +26,10 @@ impl Browser {
     /// the test.
     pub(crate) fn open(name: &str, width: u32, height: u32) -> Option<Self> {
         can_run(name, &["chromium", "chromedriver"], true).then_some(())?;
-        let mut driver = Command::new("chromedriver");
-        driver
-            .arg("--port=0")
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null());
-        let mut driver = ChildGuard::start(&mut driver);
-        let mut lines = BufReader::new(driver.child().stdout.take().unwrap()).lines();
-        let port = lines.find_map(|line| {
-            let line = line.unwrap();
-            let port = line
-                .strip_suffix('.')?
-                .split_once("started successfully on port ")?
-                .1;
-            port.parse::<u16>().ok()
-        });
-        // The driver writes nothing more of interest, but must not fail at it.
-        std::thread::spawn(move || lines.for_each(drop));
+        let (driver, port) = (0..MOST_STARTS).find_map(|_| start_driver()).unwrap();
         let mut browser = Self {
             _driver: driver,
-            address: SocketAddr::from(([127, 0, 0, 1], port.unwrap())),
+            address: SocketAddr::from(([127, 0, 0, 1], port)),
             session: String::new(),
         };
         let size = format!("--window-size={width},{height}");
@@ -180,6 +166,29 @@ impl Browser {
         assert!(head.starts_with("http/1.1 200"), "{request}: {answer:#}");
         answer["value"].take()
     }
+}
+
+/// Starts the driver, and returns it with its port; `None` if it ends at once.
+fn start_driver() -> Option<(ChildGuard, u16)> {
+    let mut driver = Command::new("chromedriver");
+    driver
+        .arg("--port=0")
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null());
+    let mut driver = ChildGuard::start(&mut driver);
+    let mut lines = BufReader::new(driver.child().stdout.take().unwrap()).lines();
+    let port = lines.find_map(|line| {
+        let line = line.unwrap();
+        let port = line
+            .strip_suffix('.')?
+            .split_once("started successfully on port ")?
+            .1;
+        port.parse().ok()
+    })?;
+    // The driver writes nothing more of interest, but must not fail at it.
+    std::thread::spawn(move || lines.for_each(drop));
+    Some((driver, port))
 }
 
 impl Drop for Browser {
