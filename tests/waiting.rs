@@ -89,7 +89,7 @@ async fn a_gateway_that_waits_to_join_holds_up_no_task() {
 #[tokio::test]
 async fn a_dropped_registration_leaves_no_name() {
     dropped_leaves_no_name(|domain| {
-        Box::pin(async { drop(domain.register("arm").await.unwrap()) })
+        Box::pin(async { assert_eq!(domain.register("arm").await.unwrap().name(), "arm") })
     })
     .await;
 }
@@ -99,7 +99,8 @@ async fn a_dropped_coalition_leaves_no_name() {
     dropped_leaves_no_name(|domain| {
         Box::pin(async {
             let options = RegisterOptions::default();
-            drop(domain.form("arm", ["leg"], None, options).await.unwrap());
+            let arm = domain.form("arm", ["leg"], None, options).await.unwrap();
+            assert_eq!(arm.name(), "arm");
         })
     })
     .await;
