@@ -36,6 +36,13 @@ fn error(text: &str, set: &[&str]) -> String {
 }
 
 #[test]
+fn an_address_of_a_legacy_peer_needs_no_brackets() {
+    let addresses: [std::net::IpAddr; 1] = ["10.0.0.9".parse().unwrap()];
+    let config = config("", &["security.legacy_peers=10.0.0.9"]);
+    assert_eq!(config.security.legacy_peers, addresses);
+}
+
+#[test]
 fn an_empty_configuration_yields_the_defaults() {
     let sources = Sources {
         host_name: "sherpa".to_owned(),
@@ -171,8 +178,8 @@ fn every_key_is_read() {
     assert!(!config.discovery.mdns);
     assert_eq!(config.security.keys, "/etc/fipa/keys");
     assert!(config.security.loopback && !config.security.insecure);
-    let old: [std::net::IpAddr; 2] = ["10.0.0.9", "::1"].map(|text| text.parse().unwrap());
-    assert_eq!(config.security.legacy_peers, old);
+    let legacy: [std::net::IpAddr; 2] = ["10.0.0.9", "::1"].map(|text| text.parse().unwrap());
+    assert_eq!(config.security.legacy_peers, legacy);
     let security = &config.security;
     assert_eq!((security.peer_connections, security.peer_letters), (8, 0));
     assert_eq!(security.peer_bytes, 1 << 20);
