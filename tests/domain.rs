@@ -6,11 +6,13 @@
 mod support;
 
 use std::collections::HashSet;
+use std::convert::Infallible;
 use std::time::Duration;
 
 use fipa::blocking::Wait;
 use fipa::error::RegisterError;
-use fipa::{AgentId, Deliveries, Domain, FailureReason, Kind, Outcome, Performative};
+use fipa::protocol::Reply;
+use fipa::{Agent, AgentId, Deliveries, Domain, FailureReason, Kind, Outcome, Performative};
 use support::{config, inform, two};
 
 fn only(deliveries: &Deliveries) -> &Outcome {
@@ -102,7 +104,30 @@ async fn a_thousand_letters_arrive_in_order_and_once() {
         here.register("rover").await.unwrap(),
         there.register("arm").await.unwrap(),
     );
-    let total = 1000_u32;
+    assert_in_order(&rover, arm, 1_000).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn letters_stay_in_order_while_several_tasks_of_their_receiver_wait() {
+    let config = config(&[]);
+    let (here, there) = two(&config).await;
+    let (rover, arm) = (
+        here.register("rover").await.unwrap(),
+        there.register("arm").await.unwrap(),
+    );
+    // Each of them takes letters, and hands over those of the other tasks.
+    let mut servers = Vec::new();
+    for protocol in ["fipa-request", "fipa-query", "fipa-contract-net"] {
+        let server = arm.serve(protocol, async |_| {
+            Ok::<_, Infallible>(Reply::Refuse("".into()))
+        });
+        servers.push(server.unwrap());
+    }
+    assert_in_order(&rover, arm, 4_000).await;
+}
+
+/// Sends numbers to an agent, and asserts that it receives them in order and once.
+async fn assert_in_order(rover: &Agent, arm: Agent, total: u32) {
     let reading = tokio::spawn(async move {
         let mut seen = Vec::new();
         while seen.len() < total as usize {
@@ -112,12 +137,10 @@ async fn a_thousand_letters_arrive_in_order_and_once() {
         }
         seen
     });
-    let rover = std::sync::Arc::new(rover);
     let mut sending = Vec::new();
     for number in 0..total {
         // Polled once here, so that the letters are sent in this order; awaited later.
-        let rover = std::sync::Arc::clone(&rover);
-        let message = inform(&rover, "arm", number.to_le_bytes());
+        let message = inform(rover, "arm", number.to_le_bytes());
         let mut send = Box::pin(async move { rover.send(message).await.unwrap() });
         let first = futures_poll_once(&mut send).await;
         sending.push((first, send));

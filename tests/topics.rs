@@ -349,6 +349,10 @@ async fn a_program_that_does_not_read_keeps_the_newest_and_other_messages_arrive
     // A task reads them, and may not have read the last ones when the first call returns.
     assert!(numbers.len() < 1_000, "{} were kept", numbers.len());
     assert!(numbers.ends_with(&[1_998, 1_999, 2_000]), "{numbers:?}");
+    // The notifications name their times in milliseconds.
+    tokio::time::sleep(Duration::from_millis(2)).await;
+    camera.publish("later").await;
+    assert_eq!(images.next().await.unwrap().number(), Some(2_001));
     assert!(images.rate().unwrap() > 0.0);
 }
 

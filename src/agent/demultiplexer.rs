@@ -35,6 +35,9 @@ const MAX_SET_ASIDE_BYTES: usize = 64 << 20;
 #[derive(Default)]
 pub(crate) struct Demultiplexer {
     state: Mutex<State>,
+    /// Held from taking a letter of the agent until it is checked and handed to its reader: of two readers, the one with
+    /// the later letter must not be first.
+    taking: Mutex<()>,
     /// Notified when a queue becomes full, and when none is full any longer.
     room: Notify,
 }
@@ -207,6 +210,16 @@ enum Reader<'a> {
     Others,
 }
 
+/// The next letter of an agent.
+enum Taken {
+    /// Its message is for the reader that has taken it.
+    Own(Incoming),
+    /// It was for another reader.
+    SetAside,
+    /// No letter has arrived.
+    Nothing,
+}
+
 impl Demultiplexer {
     /// Starts a queue for a conversation that a call leads.
     pub(crate) fn begin(&self, id: &str, from: Admitted) -> ReaderKey {
@@ -315,10 +328,11 @@ impl Demultiplexer {
             if set_aside.is_some() {
                 return set_aside;
             }
-            let received = has_room.then(|| endpoint.letter_now())?.ok()??;
-            let own = self.put(endpoint, received, Reader::Conversation(key));
-            if own.is_some() {
-                return own;
+            let taken = has_room.then(|| self.take(endpoint, Reader::Conversation(key)))?;
+            match taken.ok()? {
+                Taken::Own(own) => return Some(own),
+                Taken::SetAside => {}
+                Taken::Nothing => return None,
             }
         }
     }
@@ -343,14 +357,10 @@ impl Demultiplexer {
             if let Some(set_aside) = self.change(|state| state.take(Reader::Others)) {
                 return Ok(Some(set_aside));
             }
-            match endpoint.letter_now()? {
-                None => return Ok(None),
-                Some(received) => {
-                    let own = self.put(endpoint, received, Reader::Others);
-                    if own.is_some() {
-                        return Ok(own);
-                    }
-                }
+            match self.take(endpoint, Reader::Others)? {
+                Taken::Own(own) => return Ok(Some(own)),
+                Taken::SetAside => {}
+                Taken::Nothing => return Ok(None),
             }
         }
     }
@@ -405,14 +415,27 @@ impl Demultiplexer {
                 biased;
                 () = arrived.notified() => {}
                 () = room => {}
-                received = endpoint.next_letter(), if has_room => {
-                    if let Some(own) = self.put(endpoint, received?, reader) {
+                waits = endpoint.until_letter(), if has_room => {
+                    waits?;
+                    if let Taken::Own(own) = self.take(endpoint, reader)? {
                         return Ok(own);
                     }
                 }
                 () = endpoint.closed(), if !has_room => return Err(ReceiveError::Closed),
             }
         }
+    }
+
+    /// Takes the next letter of the agent, and hands it to its reader.
+    fn take(&self, endpoint: &Endpoint, caller: Reader<'_>) -> Result<Taken, ReceiveError> {
+        let _in_order = self.taking.lock();
+        let Some(received) = endpoint.letter_now()? else {
+            return Ok(Taken::Nothing);
+        };
+        Ok(match self.put(endpoint, received, caller) {
+            Some(own) => Taken::Own(own),
+            None => Taken::SetAside,
+        })
     }
 
     /// Hands a message to its reader: returns it if that is the caller, and otherwise sets it aside.

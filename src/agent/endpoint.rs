@@ -160,19 +160,12 @@ impl Endpoint {
         Ok(Sent::new(sending, unsettled))
     }
 
-    /// Waits for the next message of any conversation. Skips letters that cannot be decoded.
-    pub(crate) async fn next_letter(&self) -> Result<Incoming, ReceiveError> {
+    /// Waits until [`letter_now`](Self::letter_now) has a message, a letter that cannot be decoded, or an error. Another
+    /// task may take it first.
+    pub(crate) async fn until_letter(&self) -> Result<(), ReceiveError> {
         self.domain.inner.owner.check()?;
-        loop {
-            match self.mts().receive(self.incarnation).await {
-                Some(received) => {
-                    if let Some(incoming) = self.decode(received) {
-                        return Ok(incoming);
-                    }
-                }
-                None => return Err(ReceiveError::Closed),
-            }
-        }
+        self.mts().until_letter(self.incarnation).await;
+        Ok(())
     }
 
     /// Returns the next message, if one is available now. Skips letters that cannot be decoded.

@@ -73,7 +73,12 @@ impl Nothing {
     }
 
     pub(crate) async fn next_other(&self, endpoint: &Endpoint) -> Result<Incoming, ReceiveError> {
-        endpoint.next_letter().await
+        loop {
+            endpoint.until_letter().await?;
+            if let Some(incoming) = endpoint.letter_now()? {
+                return Ok(incoming);
+            }
+        }
     }
 
     pub(crate) fn other_now(&self, endpoint: &Endpoint) -> Result<Option<Incoming>, ReceiveError> {

@@ -569,21 +569,32 @@ impl Mts {
     /// Waits for the next letter for this agent; `None` when the agent was deregistered or the
     /// service closed.
     pub async fn receive(&self, agent: Incarnation) -> Option<Received> {
-        let waiter = Arc::clone(self.shared.lock().agents.get(&agent)?);
-        self.shared
-            .wait(&waiter.notify, || {
-                if waiter.ready.load(Ordering::Acquire)
-                    && let Ok(Some(received)) = self.try_receive(agent)
-                {
-                    return Some(Some(received));
-                }
-                waiter.gone.load(Ordering::Acquire).then(|| {
-                    // Other tasks may be about to wait too, and each notification wakes one.
-                    waiter.notify.notify_one();
-                    None
-                })
+        loop {
+            self.until_letter(agent).await;
+            match self.try_receive(agent) {
+                Ok(Some(received)) => return Some(received),
+                Ok(None) => {}
+                Err(Gone) => return None,
+            }
+        }
+    }
+
+    /// Waits until [`try_receive`](Self::try_receive) has a letter for this agent, or an error. Another task may take
+    /// the letter first.
+    pub async fn until_letter(&self, agent: Incarnation) {
+        let Some(waiter) = self.shared.lock().agents.get(&agent).map(Arc::clone) else {
+            return;
+        };
+        let is_over = || {
+            if waiter.ready.load(Ordering::Acquire) {
+                return Some(());
+            }
+            waiter.gone.load(Ordering::Acquire).then(|| {
+                // Other tasks may be about to wait too, and each notification wakes one.
+                waiter.notify.notify_one();
             })
-            .await
+        };
+        self.shared.wait(&waiter.notify, is_over).await;
     }
 
     /// Waits until no more letters can arrive for this agent, because it was deregistered or the

@@ -92,6 +92,13 @@ static fipa_item next(void) {
   return item;
 }
 
+/* Returns the handle of the next item, which must not say a failure. */
+static fipa_handle next_handle(void) {
+  fipa_item item = next();
+  must(item.result);
+  return item.handle;
+}
+
 static void fill(uint8_t *content, size_t len) {
   for (size_t at = 0; at < len; at++) content[at] = (uint8_t)(at % 251);
 }
@@ -148,7 +155,7 @@ static void letters(void) {
 static void requests(void) {
   fipa_handle answer, lift = begin("lift", LONG), wait;
   step("agreed", next().kind == FIPA_EVENT_AGREED ? "true" : "false");
-  step_content("answer", next().handle);
+  step_content("answer", next_handle());
   must(fipa_close(lift));
   fails("refused", ask("drop", 0, LONG, &answer));
   fails("failed", ask("throw", 0, LONG, &answer));
@@ -206,7 +213,7 @@ static void notifications(void) {
   must(fipa_subscribe(agent, &subscribe, text("all"), LONG, OPERATION, &subscription));
   for (int at = 0; at < 3; at++) {
     if (published[at] != NULL) order(published[at]);
-    step_content("notification", next().handle);
+    step_content("notification", next_handle());
   }
   must(fipa_close(subscription));
 }
