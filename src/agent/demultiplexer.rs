@@ -3,7 +3,9 @@
 //!
 //! A message belongs to a conversation if it has the conversation's id and is from one of its
 //! parties, as far as the connection proves its sender. Every agent can choose any conversation id, so
-//! an agent that takes no part cannot put a message into the conversation of others.
+//! an agent that takes no part cannot put a message into the conversation of others. A conversation that another agent
+//! begins with a server starts when its first message is set aside for the server: the messages that follow at once
+//! belong to it, too.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -18,6 +20,7 @@ use tokio::sync::Notify;
 use crate::agent::endpoint::Endpoint;
 use crate::agent::incoming::Incoming;
 use crate::agent::lock_slot;
+use crate::agent::reader_key::ReaderKey;
 use crate::domain::presence;
 use crate::error::ReceiveError;
 
@@ -35,8 +38,8 @@ const MAX_SET_ASIDE_BYTES: usize = 64 << 20;
 #[derive(Default)]
 pub(crate) struct Demultiplexer {
     state: Mutex<State>,
-    /// Held from taking a letter of the agent until it is checked and handed to its reader: of two readers, the one with
-    /// the later letter must not be first.
+    /// Held while a letter of the agent is taken, checked and handed to its reader, so that two readers cannot reverse
+    /// two letters. The files of the directory may be read meanwhile.
     taking: Mutex<()>,
     /// Notified when a queue becomes full, and when none is full any longer.
     room: Notify,
@@ -44,12 +47,19 @@ pub(crate) struct Demultiplexer {
 
 #[derive(Default)]
 struct State {
-    /// The led conversations, by conversation id. Several agents may have begun one with the same id.
-    led: HashMap<Arc<str>, Vec<Conversation>>,
+    led: Led,
     served: Vec<Served>,
     others: SetAside,
     /// Whether the application has ever read the other messages.
     is_read: bool,
+}
+
+/// The led conversations.
+#[derive(Default)]
+struct Led {
+    /// By conversation id. Several agents may have begun one with the same id.
+    by_id: HashMap<Arc<str>, Vec<Conversation>>,
+    /// Number of readers that were created, including servers.
     readers: u64,
     full: FullQueues,
 }
@@ -81,6 +91,8 @@ struct Served {
     number: u64,
     precedence: Precedence,
     opens: Opens,
+    /// Whether each message begins a conversation.
+    takes_part: bool,
     queue: SetAside,
 }
 
@@ -146,11 +158,6 @@ impl SetAside {
         self.messages.is_empty()
     }
 
-    /// Adds the messages of another queue.
-    fn extend(&mut self, messages: impl IntoIterator<Item = Incoming>) {
-        messages.into_iter().for_each(|it| self.push_back(it));
-    }
-
     /// Removes all messages.
     fn take(&mut self) -> VecDeque<Incoming> {
         self.bytes = 0;
@@ -173,8 +180,37 @@ pub(crate) type Opens = Box<dyn Fn(&Message) -> bool + Send + Sync>;
 pub(crate) enum Admitted {
     /// These agents, and the services that [report](crate::agent::delivery_report) undelivered messages to them.
     Parties(Vec<Party>),
+    /// The sender of the message that has begun the conversation, until a task takes part in it.
+    Sender(Sender),
     /// Every agent.
     All,
+}
+
+/// The sender of a message, as far as its connection proves it.
+#[derive(Debug, Clone)]
+pub(crate) struct Sender {
+    name: Arc<str>,
+    /// Its registration; unknown for an agent of this process, and for one of a legacy peer.
+    agent: Incarnation,
+    is_of_this_process: bool,
+}
+
+impl Sender {
+    fn of(message: &Incoming) -> Option<Self> {
+        Some(Self {
+            name: (*message.view().sender()?.name().as_str()).into(),
+            agent: message.sender,
+            is_of_this_process: message.via.is_none(),
+        })
+    }
+
+    fn has_sent(&self, message: &Incoming) -> bool {
+        let view = message.view();
+        let name = view.sender().map(|sender| sender.name());
+        self.agent == message.sender
+            && self.is_of_this_process == message.via.is_none()
+            && name.is_some_and(|name| *name.as_str() == *self.name)
+    }
 }
 
 /// An agent that takes part in a conversation.
@@ -195,13 +231,6 @@ impl Party {
     }
 }
 
-/// A conversation that a call leads, or a server.
-#[derive(Debug, Clone)]
-pub(crate) struct ReaderKey {
-    id: Arc<str>,
-    number: u64,
-}
-
 /// A reader that waits for a message.
 #[derive(Clone, Copy)]
 enum Reader<'a> {
@@ -214,7 +243,7 @@ enum Reader<'a> {
 enum Taken {
     /// Its message is for the reader that has taken it.
     Own(Incoming),
-    /// It was for another reader.
+    /// It is set aside for another reader, or cannot be decoded.
     SetAside,
     /// No letter has arrived.
     Nothing,
@@ -232,22 +261,37 @@ impl Demultiplexer {
     }
 
     fn lead(&self, id: &str, from: Admitted, is_internal: bool) -> ReaderKey {
-        let mut state = self.state.lock();
-        let key = state.key(id);
-        let queue = SetAside::new(&state.full);
-        let conversations = state.led.entry(Arc::clone(&key.id)).or_default();
-        conversations.push(Conversation {
-            number: key.number,
-            from,
-            is_internal,
-            queue,
-        });
-        key
+        self.state.lock().led.begin(id, from, is_internal)
+    }
+
+    /// Takes over the queue of the conversation that a message has begun, or starts one. The messages of the same sender
+    /// that have arrived since are in it.
+    pub(crate) fn join(&self, id: &str, first: &Incoming, from: Admitted) -> ReaderKey {
+        self.change(|state| {
+            if let Some(begun) = &first.begun
+                && let Some(conversation) = state.led.get(begun)
+            {
+                conversation.from = from;
+                return begun.clone();
+            }
+            let key = state.led.begin(id, from, false);
+            if let Some(sender) = Sender::of(first) {
+                state.claim(&key, &sender);
+            }
+            key
+        })
+    }
+
+    /// Gives up the conversation that a message has begun. Its further messages go to `receive`.
+    pub(crate) fn abandon(&self, first: &Incoming) {
+        if let Some(begun) = &first.begun {
+            self.end(begun);
+        }
     }
 
     /// Adds an agent to a conversation.
     pub(crate) fn admit(&self, key: &ReaderKey, party: Party) {
-        if let Some(conversation) = self.state.lock().conversation(key)
+        if let Some(conversation) = self.state.lock().led.get(key)
             && let Admitted::Parties(parties) = &mut conversation.from
         {
             parties.retain(|known| known.name != party.name);
@@ -257,47 +301,45 @@ impl Demultiplexer {
 
     /// Adds every agent to a conversation.
     pub(crate) fn admit_all(&self, key: &ReaderKey) {
-        if let Some(conversation) = self.state.lock().conversation(key) {
+        if let Some(conversation) = self.state.lock().led.get(key) {
             conversation.from = Admitted::All;
         }
     }
 
     /// Ends a conversation. Its unread messages go to `receive`.
     pub(crate) fn end(&self, key: &ReaderKey) {
-        self.change(|state| {
-            let Some(conversations) = state.led.get_mut(&key.id) else {
-                return;
-            };
-            let at = conversations.iter().position(|it| it.number == key.number);
-            let ended = at.map(|at| conversations.remove(at));
-            if conversations.is_empty() {
-                state.led.remove(&key.id);
-            }
-            if let Some(mut ended) = ended.filter(|ended| !ended.is_internal) {
-                state.others.extend(ended.queue.take());
-            }
-        });
+        self.change(|state| state.end(key));
     }
 
     /// Starts a queue for the messages that a server handles: those for which `opens` returns true and that belong to no
-    /// led conversation.
+    /// led conversation, also if they wait for `receive` already. Each begins a conversation, which the server
+    /// [joins](Self::join) or [abandons](Self::abandon).
     pub(crate) fn serve(&self, opens: Opens, precedence: Precedence) -> ReaderKey {
-        let mut state = self.state.lock();
-        let key = state.key("");
-        let served = Served {
-            number: key.number,
-            precedence,
-            opens,
-            queue: SetAside::new(&state.full),
-        };
-        let after = |other: &Served| other.precedence > precedence;
-        let at = state
-            .served
-            .iter()
-            .position(after)
-            .unwrap_or(state.served.len());
-        state.served.insert(at, served);
-        key
+        self.add_server(opens, precedence, true)
+    }
+
+    /// Starts a queue like [`serve`](Self::serve) for a server to which all messages of its conversations go.
+    pub(crate) fn serve_all(&self, opens: Opens, precedence: Precedence) -> ReaderKey {
+        self.add_server(opens, precedence, false)
+    }
+
+    fn add_server(&self, opens: Opens, precedence: Precedence, takes_part: bool) -> ReaderKey {
+        self.change(|state| {
+            let key = state.led.key("");
+            let served = Served {
+                number: key.number,
+                precedence,
+                opens,
+                takes_part,
+                queue: SetAside::new(&state.led.full),
+            };
+            let after = |other: &Served| other.precedence > precedence;
+            let at = state.served.iter().position(after);
+            let at = at.unwrap_or(state.served.len());
+            state.served.insert(at, served);
+            state.hand_over(&key);
+            key
+        })
     }
 
     /// Ends a server. Its unread messages go to `receive`.
@@ -305,8 +347,15 @@ impl Demultiplexer {
         self.change(|state| {
             if let Some(at) = state.served.iter().position(|it| it.number == key.number) {
                 let left = state.served.remove(at).queue.take();
-                let is_other = |left: &Incoming| !lock_slot::is_for_locks(left);
-                state.others.extend(left.into_iter().filter(is_other));
+                for mut first in left {
+                    let begun = first.begun.take();
+                    if !lock_slot::is_for_locks(&first) {
+                        state.put_other(first);
+                    }
+                    if let Some(begun) = begun {
+                        state.end(&begun);
+                    }
+                }
             }
         });
     }
@@ -367,16 +416,21 @@ impl Demultiplexer {
 
     /// Removes and returns all messages that were set aside.
     pub(crate) fn drain(&self) -> Vec<Incoming> {
+        // Waits for the letter that a reader has taken and not handed over.
+        let _taken = self.taking.lock();
         self.change(|state| {
             let mut all: Vec<Incoming> = state.others.take().into();
+            // A message that begins a conversation precedes the others of it.
+            let served = state.served.iter_mut();
+            all.extend(served.flat_map(|server| server.queue.take()));
+            all.iter_mut().for_each(|first| first.begun = None);
             let led = state
                 .led
+                .by_id
                 .drain()
                 .flat_map(|(_, conversations)| conversations);
             let led = led.filter(|conversation| !conversation.is_internal);
             all.extend(led.flat_map(|mut conversation| conversation.queue.take()));
-            let served = state.served.iter_mut();
-            all.extend(served.flat_map(|server| server.queue.take()));
             all
         })
     }
@@ -420,6 +474,8 @@ impl Demultiplexer {
                     if let Taken::Own(own) = self.take(endpoint, reader)? {
                         return Ok(own);
                     }
+                    // Letters for others must not keep this task running.
+                    tokio::task::consume_budget().await;
                 }
                 () = endpoint.closed(), if !has_room => return Err(ReceiveError::Closed),
             }
@@ -432,10 +488,9 @@ impl Demultiplexer {
         let Some(received) = endpoint.letter_now()? else {
             return Ok(Taken::Nothing);
         };
-        Ok(match self.put(endpoint, received, caller) {
-            Some(own) => Taken::Own(own),
-            None => Taken::SetAside,
-        })
+        let decoded = endpoint.decode(received);
+        let own = decoded.and_then(|message| self.put(endpoint, message, caller));
+        Ok(own.map_or(Taken::SetAside, Taken::Own))
     }
 
     /// Hands a message to its reader: returns it if that is the caller, and otherwise sets it aside.
@@ -455,7 +510,7 @@ impl Demultiplexer {
     }
 }
 
-impl State {
+impl Led {
     fn key(&mut self, id: &str) -> ReaderKey {
         self.readers += 1;
         ReaderKey {
@@ -464,14 +519,74 @@ impl State {
         }
     }
 
-    fn conversation(&mut self, key: &ReaderKey) -> Option<&mut Conversation> {
-        let mut conversations = self.led.get_mut(&key.id)?.iter_mut();
+    fn begin(&mut self, id: &str, from: Admitted, is_internal: bool) -> ReaderKey {
+        let key = self.key(id);
+        let queue = SetAside::new(&self.full);
+        let conversations = self.by_id.entry(Arc::clone(&key.id)).or_default();
+        conversations.push(Conversation {
+            number: key.number,
+            from,
+            is_internal,
+            queue,
+        });
+        key
+    }
+
+    fn get(&mut self, key: &ReaderKey) -> Option<&mut Conversation> {
+        let mut conversations = self.by_id.get_mut(&key.id)?.iter_mut();
         conversations.find(|conversation| conversation.number == key.number)
+    }
+
+    fn remove(&mut self, key: &ReaderKey) -> Option<Conversation> {
+        let conversations = self.by_id.get_mut(&key.id)?;
+        let at = conversations.iter().position(|it| it.number == key.number);
+        let removed = at.map(|at| conversations.remove(at));
+        if conversations.is_empty() {
+            self.by_id.remove(&key.id);
+        }
+        removed
+    }
+}
+
+impl State {
+    /// Moves the messages of this sender that belong to a conversation from those for `receive` to its queue.
+    fn claim(&mut self, key: &ReaderKey, sender: &Sender) {
+        let belongs = |message: &Incoming| {
+            let id = message.conversation_id();
+            id.is_some_and(|id| *id.as_str() == *key.id) && sender.has_sent(message)
+        };
+        if !self.others.messages.iter().any(belongs) {
+            return;
+        }
+        for message in self.others.take() {
+            match self.led.get(key).filter(|_| belongs(&message)) {
+                Some(conversation) => conversation.queue.push_back(message),
+                None => self.others.push_back(message),
+            }
+        }
+    }
+
+    /// Hands the messages that wait for `receive` to the server that handles them, and that has started since.
+    fn hand_over(&mut self, server: &ReaderKey) {
+        let server = Reader::Server(server);
+        for message in self.others.take() {
+            let own = self.put(message, None, server);
+            if let (Some(own), Some(queue)) = (own, self.queue(server)) {
+                queue.push_back(own);
+            }
+        }
+    }
+
+    fn end(&mut self, key: &ReaderKey) {
+        let ended = self.led.remove(key).filter(|ended| !ended.is_internal);
+        for message in ended.into_iter().flat_map(|mut ended| ended.queue.take()) {
+            self.put_other(message);
+        }
     }
 
     fn queue(&mut self, reader: Reader<'_>) -> Option<&mut SetAside> {
         match reader {
-            Reader::Conversation(key) => Some(&mut self.conversation(key)?.queue),
+            Reader::Conversation(key) => Some(&mut self.led.get(key)?.queue),
             Reader::Server(key) => {
                 let mut served = self.served.iter_mut();
                 let server = served.find(|server| server.number == key.number)?;
@@ -495,10 +610,10 @@ impl State {
     /// Whether calls lead conversations with the message's id.
     fn leads(&self, received: &Incoming) -> bool {
         // Most agents lead none.
-        !self.led.is_empty()
+        !self.led.by_id.is_empty()
             && received
                 .conversation_id()
-                .is_some_and(|id| self.led.contains_key(&*id.as_str()))
+                .is_some_and(|id| self.led.by_id.contains_key(&*id.as_str()))
     }
 
     /// Returns the led conversation to which a message belongs.
@@ -507,11 +622,11 @@ impl State {
         received: &Incoming,
         registered: Option<&Entry>,
     ) -> Option<&mut Conversation> {
-        if self.led.is_empty() {
+        if self.led.by_id.is_empty() {
             return None;
         }
         let id = received.conversation_id()?;
-        let conversations = self.led.get_mut(&*id.as_str())?;
+        let conversations = self.led.by_id.get_mut(&*id.as_str())?;
         // The conversation that began last is the first choice.
         let mut admitting = conversations.iter_mut().rev();
         admitting.find(|it| it.from.admits(received, registered))
@@ -520,14 +635,14 @@ impl State {
     fn has_room(&self) -> bool {
         // An application that only serves reads no other messages.
         let are_read = self.is_read || self.served.is_empty();
-        self.full.load(Ordering::Relaxed) == 0 && !(are_read && self.others.is_full)
+        self.led.full.load(Ordering::Relaxed) == 0 && !(are_read && self.others.is_full)
     }
 
     /// Adds a message to the queue of its reader, or returns it if the reader is the caller, for which no
     /// earlier message waits. `registered` is the directory's entry of the sender.
     fn put(
         &mut self,
-        received: Incoming,
+        mut received: Incoming,
         registered: Option<&Entry>,
         caller: Reader<'_>,
     ) -> Option<Incoming> {
@@ -543,12 +658,30 @@ impl State {
         let mut served = self.served.iter_mut();
         let is_legal = received.violation().is_none();
         if let Some(server) = served.find(|server| is_legal && (server.opens)(received.message())) {
+            if server.takes_part
+                && let Some(sender) = Sender::of(&received)
+                && let Some(id) = received.conversation_id()
+            {
+                let begun = self
+                    .led
+                    .begin(&id.as_str(), Admitted::Sender(sender), false);
+                received.begun = Some(begun);
+            }
             let is_own = matches!(caller, Reader::Server(key) if key.number == server.number);
             return put_unless(is_own, received, &mut server.queue);
         }
         if lock_slot::is_for_locks(&received) {
             return None;
         }
+        if matches!(caller, Reader::Others) && self.others.is_empty() {
+            return Some(received);
+        }
+        self.put_other(received);
+        None
+    }
+
+    /// Adds a message to those for `receive`.
+    fn put_other(&mut self, message: Incoming) {
         while !self.is_read && !self.served.is_empty() && self.others.is_at_bound() {
             let dropped = self.others.pop_front();
             let sender = dropped.as_ref().and_then(|it| it.message().sender());
@@ -558,8 +691,7 @@ impl State {
                  Agent::receive to read them"
             );
         }
-        let is_own = matches!(caller, Reader::Others);
-        put_unless(is_own, received, &mut self.others)
+        self.others.push_back(message);
     }
 }
 
@@ -584,8 +716,10 @@ fn is_about_presence(received: &Incoming) -> bool {
 impl Admitted {
     /// Whether a message with the id of the conversation belongs to it.
     fn admits(&self, incoming: &Incoming, registered: Option<&Entry>) -> bool {
-        let Self::Parties(parties) = self else {
-            return true;
+        let parties = match self {
+            Self::Parties(parties) => parties,
+            Self::Sender(sender) => return sender.has_sent(incoming),
+            Self::All => return true,
         };
         let view = incoming.view();
         let Some(sender) = view.sender().map(|sender| sender.name().as_str()) else {
@@ -689,7 +823,7 @@ mod tests {
         assert!(state.put(inform(), Some(&arm), conversation).is_some());
         assert!(state.put(inform(), Some(&arm), Reader::Others).is_none());
         assert!(state.put(inform(), Some(&arm), conversation).is_none());
-        assert_eq!(state.conversation(&key).unwrap().queue.messages.len(), 2);
+        assert_eq!(state.led.get(&key).unwrap().queue.messages.len(), 2);
         // Of no conversation.
         let other = || message("mallory", MALLORY, Performative::Inform);
         assert!(state.put(other(), None, Reader::Others).is_some());
@@ -729,7 +863,7 @@ mod tests {
             ),
         ] {
             set_aside(&mut state, message(sender, from, act), Some(registered));
-            let conversation = state.conversation(&key).unwrap();
+            let conversation = state.led.get(&key).unwrap();
             let found = conversation.queue.pop_front().is_some();
             assert_eq!(found, belongs, "{sender} by {}", registered.name);
         }
@@ -840,6 +974,196 @@ mod tests {
             Some(&leg_entry),
         );
         assert!(state.take(Reader::Conversation(&with_leg)).is_some());
+    }
+
+    /// A request, and two cancels of its conversation, the second one of an outsider.
+    fn request_and_cancels(state: &mut State) {
+        let (arm, mallory) = (entry("arm", ARM), entry("mallory", MALLORY));
+        for (from, sender, act) in [
+            (ARM, &arm, Performative::Request),
+            (ARM, &arm, Performative::Cancel),
+            (MALLORY, &mallory, Performative::Cancel),
+        ] {
+            set_aside(state, message("arm", from, act), Some(sender));
+        }
+    }
+
+    fn serve_requests(demultiplexer: &Demultiplexer) -> ReaderKey {
+        let is_request = |message: &Message| *message.performative() == Performative::Request;
+        demultiplexer.serve(Box::new(is_request), Precedence::Protocol)
+    }
+
+    /// Takes all messages for a reader: their performatives and senders.
+    fn taken(state: &mut State, reader: Reader<'_>) -> Vec<(Performative, Incarnation)> {
+        let taken = std::iter::from_fn(|| state.take(reader));
+        taken
+            .map(|it| (it.message().performative().clone(), it.sender))
+            .collect()
+    }
+
+    #[test]
+    fn messages_that_follow_at_once_wait_for_the_server_that_takes_part() {
+        let demultiplexer = Demultiplexer::default();
+        let server = serve_requests(&demultiplexer);
+        let first = {
+            let mut state = demultiplexer.state.lock();
+            request_and_cancels(&mut state);
+            let first = state.take(Reader::Server(&server)).unwrap();
+            let others = taken(&mut state, Reader::Others);
+            assert_eq!(others, [(Performative::Cancel, MALLORY)]);
+            first
+        };
+        let arm = Party::new("arm", Some(&entry("arm", ARM)));
+        let key = demultiplexer.join("c", &first, Admitted::Parties(vec![arm]));
+        let mut state = demultiplexer.state.lock();
+        let conversation = taken(&mut state, Reader::Conversation(&key));
+        assert_eq!(conversation, [(Performative::Cancel, ARM)]);
+        assert_eq!(state.led.by_id.len(), 1);
+    }
+
+    /// The sender of a letter of this process is as unknown as that of a letter of a legacy peer.
+    #[test]
+    fn a_begun_conversation_admits_the_sender_of_its_first_message_only() {
+        let unknown = Incarnation::UNKNOWN;
+        let gateway = Incarnation::from_u64(6);
+        let relay = Entry {
+            role: Role::Gateway,
+            ..Entry::clone(&entry("gateway", gateway))
+        };
+        let of = |agent, via, act| {
+            let mut message = message("arm", agent, act);
+            message.via = via;
+            message
+        };
+        let shm = Some(Kind::Shm);
+        for (first, next, registered, belongs) in [
+            ((unknown, None), (unknown, None), None, true),
+            ((unknown, None), (unknown, shm), None, false),
+            ((unknown, None), (gateway, shm), Some(&relay), false),
+            ((ARM, shm), (gateway, shm), Some(&relay), false),
+            ((gateway, shm), (gateway, shm), Some(&relay), true),
+        ] {
+            let demultiplexer = Demultiplexer::default();
+            let server = serve_requests(&demultiplexer);
+            let mut state = demultiplexer.state.lock();
+            let request = of(first.0, first.1, Performative::Request);
+            set_aside(&mut state, request, registered);
+            let cancel = of(next.0, next.1, Performative::Cancel);
+            set_aside(&mut state, cancel.clone(), registered);
+            let began = state.take(Reader::Server(&server)).unwrap();
+            drop(state);
+            let key = demultiplexer.join("c", &began, Admitted::All);
+            let mut state = demultiplexer.state.lock();
+            let found = state.take(Reader::Conversation(&key)).is_some();
+            assert_eq!(found, belongs, "{first:?}, {next:?}");
+            // The same holds if the application reads the first message.
+            let key = state.led.begin("c", Admitted::All, false);
+            state.others.push_back(cancel);
+            state.claim(&key, &Sender::of(&began).unwrap());
+            let found = state.take(Reader::Conversation(&key)).is_some();
+            assert_eq!(found, belongs, "{first:?}, {next:?}");
+        }
+    }
+
+    #[test]
+    fn messages_that_wait_for_receive_go_to_the_server_that_starts() {
+        let demultiplexer = Demultiplexer::default();
+        let (arm, leg) = (entry("arm", ARM), entry("leg", MALLORY));
+        let mut state = demultiplexer.state.lock();
+        set_aside(
+            &mut state,
+            message("leg", MALLORY, Performative::Inform),
+            Some(&leg),
+        );
+        for act in [Performative::Request, Performative::Cancel] {
+            set_aside(&mut state, message("arm", ARM, act), Some(&arm));
+        }
+        drop(state);
+        let server = serve_requests(&demultiplexer);
+        let mut state = demultiplexer.state.lock();
+        let first = state.take(Reader::Server(&server)).unwrap();
+        assert!(state.take(Reader::Server(&server)).is_none());
+        let others = taken(&mut state, Reader::Others);
+        assert_eq!(others, [(Performative::Inform, MALLORY)]);
+        let key = first.begun.unwrap();
+        let conversation = taken(&mut state, Reader::Conversation(&key));
+        assert_eq!(conversation, [(Performative::Cancel, ARM)]);
+    }
+
+    #[test]
+    fn messages_of_an_abandoned_conversation_are_bounded() {
+        let demultiplexer = Demultiplexer::default();
+        let server = serve_requests(&demultiplexer);
+        let arm = entry("arm", ARM);
+        for _ in 0..3 {
+            let mut state = demultiplexer.state.lock();
+            request_and_cancels(&mut state);
+            for _ in 0..MAX_SET_ASIDE / 2 {
+                let cancel = message("arm", ARM, Performative::Cancel);
+                set_aside(&mut state, cancel, Some(&arm));
+            }
+            let first = state.take(Reader::Server(&server)).unwrap();
+            drop(state);
+            demultiplexer.abandon(&first);
+        }
+        let state = demultiplexer.state.lock();
+        assert_eq!(state.others.messages.len(), MAX_SET_ASIDE);
+        assert!(state.has_room());
+    }
+
+    #[test]
+    fn unread_messages_name_no_conversation_of_the_agent_that_has_ended() {
+        let demultiplexer = Demultiplexer::default();
+        let _server = serve_requests(&demultiplexer);
+        request_and_cancels(&mut demultiplexer.state.lock());
+        let unread = demultiplexer.drain();
+        assert!(unread.iter().all(|it| it.begun.is_none()));
+        let acts = unread.iter().map(|it| it.message().performative().clone());
+        let (request, cancel) = (Performative::Request, Performative::Cancel);
+        assert_eq!(acts.collect::<Vec<_>>(), [cancel.clone(), request, cancel]);
+    }
+
+    #[test]
+    fn messages_that_follow_one_without_a_server_go_to_receive() {
+        let cancels = [(Performative::Cancel, MALLORY), (Performative::Cancel, ARM)];
+        let demultiplexer = Demultiplexer::default();
+        let server = serve_requests(&demultiplexer);
+        let first = {
+            let mut state = demultiplexer.state.lock();
+            request_and_cancels(&mut state);
+            state.take(Reader::Server(&server)).unwrap()
+        };
+        // The server cannot take part.
+        demultiplexer.abandon(&first);
+        let mut state = demultiplexer.state.lock();
+        assert_eq!(taken(&mut state, Reader::Others), cancels);
+        assert!(state.led.by_id.is_empty());
+        // The server has ended before.
+        request_and_cancels(&mut state);
+        drop(state);
+        demultiplexer.end_serving(&server);
+        let mut state = demultiplexer.state.lock();
+        let [outsider, own] = cancels;
+        let request = (Performative::Request, ARM);
+        assert_eq!(taken(&mut state, Reader::Others), [outsider, request, own]);
+        assert!(state.led.by_id.is_empty());
+    }
+
+    #[test]
+    fn messages_that_wait_for_receive_belong_to_the_conversation_that_the_application_joins() {
+        let demultiplexer = Demultiplexer::default();
+        let first = {
+            let mut state = demultiplexer.state.lock();
+            request_and_cancels(&mut state);
+            state.take(Reader::Others).unwrap()
+        };
+        let arm = Party::new("arm", Some(&entry("arm", ARM)));
+        let key = demultiplexer.join("c", &first, Admitted::Parties(vec![arm]));
+        let mut state = demultiplexer.state.lock();
+        let conversation = taken(&mut state, Reader::Conversation(&key));
+        assert_eq!(conversation, [(Performative::Cancel, ARM)]);
+        let others = taken(&mut state, Reader::Others);
+        assert_eq!(others, [(Performative::Cancel, MALLORY)]);
     }
 
     #[test]

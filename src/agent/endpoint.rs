@@ -160,27 +160,17 @@ impl Endpoint {
         Ok(Sent::new(sending, unsettled))
     }
 
-    /// Waits until [`letter_now`](Self::letter_now) has a message, a letter that cannot be decoded, or an error. Another
-    /// task may take it first.
+    /// Waits until [`letter_now`](Self::letter_now) has a letter or an error. Another task may take the letter first.
     pub(crate) async fn until_letter(&self) -> Result<(), ReceiveError> {
         self.domain.inner.owner.check()?;
         self.mts().until_letter(self.incarnation).await;
         Ok(())
     }
 
-    /// Returns the next message, if one is available now. Skips letters that cannot be decoded.
-    pub(crate) fn letter_now(&self) -> Result<Option<Incoming>, ReceiveError> {
-        loop {
-            match self.mts().try_receive(self.incarnation) {
-                Err(Gone) => return Err(ReceiveError::Closed),
-                Ok(None) => return Ok(None),
-                Ok(Some(received)) => {
-                    if let Some(incoming) = self.decode(received) {
-                        return Ok(Some(incoming));
-                    }
-                }
-            }
-        }
+    /// Returns the next letter, if one is available now.
+    pub(crate) fn letter_now(&self) -> Result<Option<Received>, ReceiveError> {
+        let received = self.mts().try_receive(self.incarnation);
+        received.map_err(|Gone| ReceiveError::Closed)
     }
 
     /// Waits until the domain is closed.

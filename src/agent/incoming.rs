@@ -16,6 +16,8 @@ use fipa_mts::stamped_peer;
 use fipa_sds::Entry;
 use fipa_transport::{Incarnation, Kind, PeerId};
 
+#[cfg(feature = "protocols")]
+use crate::agent::reader_key::ReaderKey;
 #[cfg(feature = "opentelemetry")]
 use crate::agent::trace_context;
 #[cfg(feature = "protocols")]
@@ -43,6 +45,9 @@ pub struct Incoming {
     /// [`crate::agent::delivery_report`].
     #[cfg(feature = "protocols")]
     pub(crate) undelivered_to: Option<Box<str>>,
+    /// The conversation that the message has begun, if it is from the queue of a server.
+    #[cfg(feature = "protocols")]
+    pub(crate) begun: Option<ReaderKey>,
 }
 
 #[derive(Debug, Clone)]
@@ -86,6 +91,8 @@ impl Incoming {
             violation: None,
             #[cfg(feature = "protocols")]
             undelivered_to: None,
+            #[cfg(feature = "protocols")]
+            begun: None,
         })
     }
 

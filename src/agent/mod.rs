@@ -11,6 +11,8 @@ pub(crate) mod endpoint;
 pub(crate) mod incoming;
 #[cfg(feature = "protocols")]
 pub(crate) mod lock_slot;
+#[cfg(feature = "protocols")]
+pub(crate) mod reader_key;
 pub(crate) mod sender_tasks;
 pub(crate) mod stated;
 #[cfg(feature = "protocols")]

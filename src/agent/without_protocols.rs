@@ -75,14 +75,19 @@ impl Nothing {
     pub(crate) async fn next_other(&self, endpoint: &Endpoint) -> Result<Incoming, ReceiveError> {
         loop {
             endpoint.until_letter().await?;
-            if let Some(incoming) = endpoint.letter_now()? {
+            if let Some(incoming) = self.other_now(endpoint)? {
                 return Ok(incoming);
             }
         }
     }
 
     pub(crate) fn other_now(&self, endpoint: &Endpoint) -> Result<Option<Incoming>, ReceiveError> {
-        endpoint.letter_now()
+        while let Some(received) = endpoint.letter_now()? {
+            if let Some(incoming) = endpoint.decode(received) {
+                return Ok(Some(incoming));
+            }
+        }
+        Ok(None)
     }
 
     pub(crate) fn drain(&self) -> Vec<Incoming> {

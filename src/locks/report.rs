@@ -21,8 +21,9 @@ use serde::{Deserialize, Serialize};
 use super::shell::Shared;
 use super::{LockError, owned};
 use crate::agent::AgentCore;
-use crate::agent::demultiplexer::{Admitted, Party, ReaderKey};
+use crate::agent::demultiplexer::{Admitted, Party};
 use crate::agent::lock_slot::STATUS_PROTOCOL;
+use crate::agent::reader_key::ReaderKey;
 
 /// Maximum length of the content of an answer, in bytes.
 const MAX_CONTENT: usize = 1 << 20;

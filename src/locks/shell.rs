@@ -27,9 +27,10 @@ use super::state_file::StateFile;
 use super::{LockError, LockOptions, report};
 use crate::DirectoryView;
 use crate::agent::AgentCore;
-use crate::agent::demultiplexer::{Precedence, ReaderKey};
+use crate::agent::demultiplexer::Precedence;
 use crate::agent::incoming::Incoming;
 use crate::agent::lock_slot::{self, RunningLocks, Slot};
+use crate::agent::reader_key::ReaderKey;
 use crate::domain::background;
 use crate::protocol::{PartnerEvent, PartnerWatch};
 
@@ -115,7 +116,7 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
         // From here on, no message and no change of the directory is missed.
         messages: core
             .demultiplexer
-            .serve(Box::new(lock_slot::is_of_locks), Precedence::Part),
+            .serve_all(Box::new(lock_slot::is_of_locks), Precedence::Part),
         changes: Some(endpoint.domain.directory().watch()),
         partners: PartnerWatch::new(Arc::clone(core)),
         watched: HashSet::new(),

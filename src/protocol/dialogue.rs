@@ -20,8 +20,9 @@ use super::watching::PartnerWatch;
 use crate::agent::AgentCore;
 use crate::agent::checks::{header_of_outcomes, now};
 use crate::agent::delivery::{Deliveries, Delivery, Sent, deliveries};
-use crate::agent::demultiplexer::{Admitted, Party, ReaderKey};
+use crate::agent::demultiplexer::{Admitted, Party};
 use crate::agent::incoming::Incoming;
+use crate::agent::reader_key::ReaderKey;
 use crate::error::{ReceiveError, SendError};
 
 /// Maximum number of `reply-to` names of a participant that are followed.
@@ -242,11 +243,22 @@ impl Dialogue {
 
     /// Takes part in the conversation that a message has begun.
     pub(crate) fn join(core: &Arc<AgentCore>, incoming: &Incoming) -> Result<Self, DialogueError> {
+        let speaker = Self::check_first(core, incoming);
+        let speaker = speaker.inspect_err(|_| core.demultiplexer.abandon(incoming))?;
+        let first = incoming.message();
+        let initiator = name_of(first);
+        let mut dialogue = Self::of(speaker, std::iter::once(initiator.as_str()), Some(incoming));
+        dialogue.partners.add(&initiator);
+        dialogue.follow_delegates(first);
+        Ok(dialogue)
+    }
+
+    /// Checks the message that begins a conversation.
+    fn check_first(core: &Arc<AgentCore>, incoming: &Incoming) -> Result<Speaker, DialogueError> {
         let first = incoming.message();
         let id = first.conversation_id();
         let id = id.ok_or(DialogueError::Unchecked(Unchecked::NoConversation))?;
-        let initiator = name_of(first);
-        if initiator == *core.endpoint.name {
+        if name_of(first) == *core.endpoint.name {
             return Err(DialogueError::NotOpening(Box::new(first.clone())));
         }
         let mut speaker = Speaker::new(core, first.protocol().unwrap_or_default(), id.to_owned());
@@ -261,10 +273,7 @@ impl Dialogue {
             }
             Err(failure) => return Err(failure.on_received(first)),
         }
-        let mut dialogue = Self::of(speaker, std::iter::once(initiator.as_str()));
-        dialogue.partners.add(&initiator);
-        dialogue.follow_delegates(first);
-        Ok(dialogue)
+        Ok(speaker)
     }
 
     fn led<'n>(
@@ -273,10 +282,15 @@ impl Dialogue {
         id: String,
         with: impl Iterator<Item = &'n str>,
     ) -> Self {
-        Self::of(Speaker::new(core, protocol, id), with)
+        Self::of(Speaker::new(core, protocol, id), with, None)
     }
 
-    fn of<'n>(speaker: Speaker, with: impl Iterator<Item = &'n str>) -> Self {
+    /// `first` is the message of a partner that has begun the conversation.
+    fn of<'n>(
+        speaker: Speaker,
+        with: impl Iterator<Item = &'n str>,
+        first: Option<&Incoming>,
+    ) -> Self {
         let core = &speaker.core;
         // Before the first message is sent, so that no departure is missed.
         let partners = PartnerWatch::new(Arc::clone(core));
@@ -287,7 +301,10 @@ impl Dialogue {
         let parties = with.map(|name| Party::new(name, directory.lookup(name).as_deref()));
         let parties = Admitted::Parties(parties.collect());
         Self {
-            key: core.demultiplexer.begin(&speaker.id, parties),
+            key: match first {
+                Some(first) => core.demultiplexer.join(&speaker.id, first, parties),
+                None => core.demultiplexer.begin(&speaker.id, parties),
+            },
             speaker,
             partners,
             reachability: ReachabilitySender::default(),

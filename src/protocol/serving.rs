@@ -10,8 +10,9 @@ use tokio::task::{JoinError, JoinHandle};
 
 use super::dialogue::{DialogueError, opens};
 use super::participant::{Farewell, Home, Reply, Task};
-use crate::agent::demultiplexer::{Opens, Precedence, ReaderKey};
+use crate::agent::demultiplexer::{Opens, Precedence};
 use crate::agent::incoming::Incoming;
+use crate::agent::reader_key::ReaderKey;
 use crate::agent::{Agent, AgentCore};
 use crate::protocol::peer_shares::PeerPlaces;
 
@@ -25,6 +26,8 @@ impl Agent {
     /// `failure` with the text of the error, or a `not-understood` if the handler has sent nothing.
     ///
     /// Conversations about the actions and topics of the agent go to those, and not to the handler.
+    ///
+    /// Messages that have arrived before this call, and that the application has not received, go to the handler, too.
     ///
     /// The other messages go to [`receive`](Self::receive). If the application never calls `receive`,
     /// the earliest of 1,024 unread messages is dropped, with a warning in the log.

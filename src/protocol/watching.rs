@@ -11,8 +11,9 @@ use fipa_sds::{Change, Directory, Entry, Reach, Role, Watch};
 use fipa_transport::{Incarnation, log_limit};
 
 use super::partners::{PartnerEvent, Partners};
-use crate::agent::demultiplexer::{Admitted, Party, ReaderKey};
+use crate::agent::demultiplexer::{Admitted, Party};
 use crate::agent::incoming::Incoming;
+use crate::agent::reader_key::ReaderKey;
 use crate::agent::{Agent, AgentCore};
 use crate::domain::presence::{self, Asked};
 

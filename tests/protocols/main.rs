@@ -351,6 +351,45 @@ fn a_subscription_that_is_dropped_after_its_publisher_has_gone_keeps_no_thread_b
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_request_that_arrives_before_its_server_starts_is_answered() {
+    let (rover, arm) = pair(&[]).await;
+    // It takes the letters of the agent, also those that are not for it.
+    let _publisher = arm.publisher("charge").unwrap();
+    let lift = rover.message(Performative::Request).receiver("arm");
+    let mut request = rover.request(lift, TIMEOUT).await.unwrap();
+    let subscribe = rover.message(Performative::Subscribe).receiver("arm");
+    let subscribe = subscribe.content("charge");
+    drop(rover.subscribe(subscribe, TIMEOUT).await.unwrap());
+    let _server = arm.serve("fipa-request", async |_| {
+        Ok::<_, DialogueError>(Reply::Inform("lifted".into()))
+    });
+    let answer = request.result().await.unwrap();
+    assert_eq!(answer.text(), "lifted");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn requests_that_are_cancelled_at_once_are_cancelled() {
+    let (rover, arm) = pair(&[]).await;
+    let _server = arm.serve("fipa-request", async |mut task: Task| {
+        task.agree("").await?;
+        task.cancelled().await?;
+        task.confirm_cancel().await
+    });
+    let cancel = async |rover: Agent| {
+        let lift = rover.message(Performative::Request).receiver("arm");
+        let mut request = rover.request(lift, TIMEOUT).await.unwrap();
+        request.cancel(TIMEOUT).await
+    };
+    let all: Vec<_> = (0..600)
+        .map(|_| tokio::spawn(cancel(rover.clone())))
+        .collect();
+    for canceled in all {
+        assert!(canceled.await.unwrap().unwrap());
+    }
+    assert!(arm.try_receive().unwrap().is_none());
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_request_is_cancelled() {
     let (rover, arm) = pair(&[]).await;
     let initiator = async {
