@@ -39,7 +39,8 @@ const MAX_SET_ASIDE_BYTES: usize = 64 << 20;
 pub(crate) struct Demultiplexer {
     state: Mutex<State>,
     /// Held while a letter of the agent is taken, checked and handed to its reader, so that two readers cannot reverse
-    /// two letters. The files of the directory may be read meanwhile.
+    /// two letters. The other readers of the agent wait while the files of the directory are read, or while the sender
+    /// of a letter gets a `not-understood`.
     taking: Mutex<()>,
     /// Notified when a queue becomes full, and when none is full any longer.
     room: Notify,
@@ -91,7 +92,7 @@ struct Served {
     number: u64,
     precedence: Precedence,
     opens: Opens,
-    /// Whether each message begins a conversation.
+    /// Whether its messages begin conversations.
     takes_part: bool,
     queue: SetAside,
 }
@@ -237,6 +238,8 @@ enum Reader<'a> {
     Conversation(&'a ReaderKey),
     Server(&'a ReaderKey),
     Others,
+    /// The caller only hands a message over.
+    Nobody,
 }
 
 /// The next letter of an agent.
@@ -282,7 +285,7 @@ impl Demultiplexer {
         })
     }
 
-    /// Gives up the conversation that a message has begun. Its further messages go to `receive`.
+    /// Gives up the conversation that a message has begun, and [ends](Self::end) it.
     pub(crate) fn abandon(&self, first: &Incoming) {
         if let Some(begun) = &first.begun {
             self.end(begun);
@@ -306,14 +309,14 @@ impl Demultiplexer {
         }
     }
 
-    /// Ends a conversation. Its unread messages go to `receive`.
+    /// Ends a conversation. Its unread messages go to a server that handles them, or to `receive`.
     pub(crate) fn end(&self, key: &ReaderKey) {
         self.change(|state| state.end(key));
     }
 
     /// Starts a queue for the messages that a server handles: those for which `opens` returns true and that belong to no
-    /// led conversation, also if they wait for `receive` already. Each begins a conversation, which the server
-    /// [joins](Self::join) or [abandons](Self::abandon).
+    /// led conversation, also if they wait for `receive` already. One with a sender and a conversation id begins a
+    /// conversation, which the server [joins](Self::join) or [abandons](Self::abandon).
     pub(crate) fn serve(&self, opens: Opens, precedence: Precedence) -> ReaderKey {
         self.add_server(opens, precedence, true)
     }
@@ -337,24 +340,25 @@ impl Demultiplexer {
             let at = state.served.iter().position(after);
             let at = at.unwrap_or(state.served.len());
             state.served.insert(at, served);
-            state.hand_over(&key);
+            // Messages that have arrived before it.
+            let waiting = state.others.take();
+            waiting
+                .into_iter()
+                .for_each(|message| state.put_again(message));
             key
         })
     }
 
-    /// Ends a server. Its unread messages go to `receive`.
+    /// Ends a server. Its unread messages go to another one that handles them, or to `receive`.
     pub(crate) fn end_serving(&self, key: &ReaderKey) {
         self.change(|state| {
             if let Some(at) = state.served.iter().position(|it| it.number == key.number) {
-                let left = state.served.remove(at).queue.take();
-                for mut first in left {
+                for mut first in state.served.remove(at).queue.take() {
                     let begun = first.begun.take();
-                    if !lock_slot::is_for_locks(&first) {
-                        state.put_other(first);
-                    }
-                    if let Some(begun) = begun {
-                        state.end(&begun);
-                    }
+                    let begun = begun.and_then(|begun| state.led.remove(&begun));
+                    state.put_again(first);
+                    let further = begun.into_iter().flat_map(|mut begun| begun.queue.take());
+                    further.for_each(|message| state.put_again(message));
                 }
             }
         });
@@ -371,19 +375,7 @@ impl Demultiplexer {
 
     /// Returns the next message of a conversation, if one is available now.
     pub(crate) fn now_of(&self, endpoint: &Endpoint, key: &ReaderKey) -> Option<Incoming> {
-        loop {
-            let (set_aside, has_room) =
-                self.change(|state| (state.take(Reader::Conversation(key)), state.has_room()));
-            if set_aside.is_some() {
-                return set_aside;
-            }
-            let taken = has_room.then(|| self.take(endpoint, Reader::Conversation(key)))?;
-            match taken.ok()? {
-                Taken::Own(own) => return Some(own),
-                Taken::SetAside => {}
-                Taken::Nothing => return None,
-            }
-        }
+        self.now(endpoint, Reader::Conversation(key)).ok()?
     }
 
     /// Waits for the next message for a server.
@@ -395,6 +387,11 @@ impl Demultiplexer {
         self.next(endpoint, Reader::Server(key)).await
     }
 
+    /// Returns the next message for a server, if one is available now.
+    pub(crate) fn now_served(&self, endpoint: &Endpoint, key: &ReaderKey) -> Option<Incoming> {
+        self.now(endpoint, Reader::Server(key)).ok()?
+    }
+
     /// Waits for the next message of no led conversation.
     pub(crate) async fn next_other(&self, endpoint: &Endpoint) -> Result<Incoming, ReceiveError> {
         self.next(endpoint, Reader::Others).await
@@ -402,16 +399,7 @@ impl Demultiplexer {
 
     /// Returns the next message of no led conversation, if one is available now.
     pub(crate) fn other_now(&self, endpoint: &Endpoint) -> Result<Option<Incoming>, ReceiveError> {
-        loop {
-            if let Some(set_aside) = self.change(|state| state.take(Reader::Others)) {
-                return Ok(Some(set_aside));
-            }
-            match self.take(endpoint, Reader::Others)? {
-                Taken::Own(own) => return Ok(Some(own)),
-                Taken::SetAside => {}
-                Taken::Nothing => return Ok(None),
-            }
-        }
+        self.now(endpoint, Reader::Others)
     }
 
     /// Removes and returns all messages that were set aside.
@@ -482,9 +470,40 @@ impl Demultiplexer {
         }
     }
 
+    fn now(
+        &self,
+        endpoint: &Endpoint,
+        reader: Reader<'_>,
+    ) -> Result<Option<Incoming>, ReceiveError> {
+        // Letters for others that go on to arrive do not keep the caller.
+        for _ in 0..MAX_SET_ASIDE {
+            let (set_aside, has_room) = self.change(|state| (state.take(reader), state.has_room()));
+            if set_aside.is_some() {
+                return Ok(set_aside);
+            }
+            if !has_room {
+                return if endpoint.is_closed() {
+                    Err(ReceiveError::Closed)
+                } else {
+                    Ok(None)
+                };
+            }
+            match self.take(endpoint, reader)? {
+                Taken::Own(own) => return Ok(Some(own)),
+                Taken::SetAside => {}
+                Taken::Nothing => return Ok(None),
+            }
+        }
+        Ok(None)
+    }
+
     /// Takes the next letter of the agent, and hands it to its reader.
     fn take(&self, endpoint: &Endpoint, caller: Reader<'_>) -> Result<Taken, ReceiveError> {
         let _in_order = self.taking.lock();
+        // Another reader may have set it aside while this one waited for the lock.
+        if let Some(own) = self.change(|state| state.take(caller)) {
+            return Ok(Taken::Own(own));
+        }
         let Some(received) = endpoint.letter_now()? else {
             return Ok(Taken::Nothing);
         };
@@ -566,22 +585,16 @@ impl State {
         }
     }
 
-    /// Hands the messages that wait for `receive` to the server that handles them, and that has started since.
-    fn hand_over(&mut self, server: &ReaderKey) {
-        let server = Reader::Server(server);
-        for message in self.others.take() {
-            let own = self.put(message, None, server);
-            if let (Some(own), Some(queue)) = (own, self.queue(server)) {
-                queue.push_back(own);
-            }
-        }
-    }
-
     fn end(&mut self, key: &ReaderKey) {
         let ended = self.led.remove(key).filter(|ended| !ended.is_internal);
-        for message in ended.into_iter().flat_map(|mut ended| ended.queue.take()) {
-            self.put_other(message);
-        }
+        let unread = ended.into_iter().flat_map(|mut ended| ended.queue.take());
+        unread.for_each(|message| self.put_again(message));
+    }
+
+    /// Adds a message to the queue of its reader, which is another one than when it arrived.
+    fn put_again(&mut self, message: Incoming) {
+        let own = self.put(message, None, Reader::Nobody);
+        debug_assert!(own.is_none(), "the caller reads nothing");
     }
 
     fn queue(&mut self, reader: Reader<'_>) -> Option<&mut SetAside> {
@@ -593,6 +606,7 @@ impl State {
                 Some(&mut server.queue)
             }
             Reader::Others => Some(&mut self.others),
+            Reader::Nobody => None,
         }
     }
 
@@ -761,11 +775,7 @@ mod tests {
 
     /// Adds a message for a reader other than the caller.
     fn set_aside(state: &mut State, received: Incoming, registered: Option<&Entry>) {
-        let another = ReaderKey {
-            id: "".into(),
-            number: 0,
-        };
-        let own = state.put(received, registered, Reader::Server(&another));
+        let own = state.put(received, registered, Reader::Nobody);
         assert!(own.is_none());
     }
 
@@ -1088,6 +1098,36 @@ mod tests {
         let key = first.begun.unwrap();
         let conversation = taken(&mut state, Reader::Conversation(&key));
         assert_eq!(conversation, [(Performative::Cancel, ARM)]);
+    }
+
+    #[test]
+    fn messages_of_a_server_that_ends_go_to_another_one() {
+        let demultiplexer = Demultiplexer::default();
+        let former = serve_requests(&demultiplexer);
+        request_and_cancels(&mut demultiplexer.state.lock());
+        let server = serve_requests(&demultiplexer);
+        demultiplexer.end_serving(&former);
+        let mut state = demultiplexer.state.lock();
+        let first = state.take(Reader::Server(&server)).unwrap();
+        let key = first.begun.unwrap();
+        let conversation = taken(&mut state, Reader::Conversation(&key));
+        assert_eq!(conversation, [(Performative::Cancel, ARM)]);
+        assert_eq!(state.led.by_id.len(), 1);
+    }
+
+    #[test]
+    fn a_second_request_with_the_id_of_the_first_one_is_served_after_it() {
+        let demultiplexer = Demultiplexer::default();
+        let server = serve_requests(&demultiplexer);
+        let mut state = demultiplexer.state.lock();
+        request_and_cancels(&mut state);
+        let first = state.take(Reader::Server(&server)).unwrap();
+        request_and_cancels(&mut state);
+        assert!(state.take(Reader::Server(&server)).is_none());
+        drop(state);
+        demultiplexer.abandon(&first);
+        let mut state = demultiplexer.state.lock();
+        assert!(state.take(Reader::Server(&server)).is_some());
     }
 
     #[test]

@@ -173,6 +173,12 @@ impl Endpoint {
         received.map_err(|Gone| ReceiveError::Closed)
     }
 
+    /// Whether no more letters can arrive.
+    #[cfg(feature = "protocols")]
+    pub(crate) fn is_closed(&self) -> bool {
+        self.mts().is_gone(self.incarnation)
+    }
+
     /// Waits until the domain is closed.
     #[cfg(feature = "protocols")]
     pub(crate) async fn closed(&self) {

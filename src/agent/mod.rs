@@ -405,9 +405,9 @@ impl Agent {
         self.core.demultiplexer.other_now(endpoint)
     }
 
-    /// Removes the name from the directory, and returns the messages that were delivered but not
-    /// received, in order. The name can be registered again at once, here or on another host. Letters
-    /// in transit follow the name there, or fail.
+    /// Removes the name from the directory, and returns the messages that were delivered but not received, those of each
+    /// conversation in order. The name can be registered again at once, here or on another host. Letters in transit
+    /// follow the name there, or fail.
     ///
     /// The registration ends for all handles: `receive` on another handle fails with
     /// [`ReceiveError::Closed`], `send` with [`SendError::Deregistered`], and a second `deregister` with

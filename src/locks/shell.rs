@@ -662,7 +662,7 @@ impl Task {
                     });
                 }
                 event = self.partners.next() => if let PartnerEvent::Gone { agent } = event {
-                    self.handle_waiting().await;
+                    self.handle_waiting();
                     self.departed(&agent);
                 },
                 change = next_change(changes) => match change {
@@ -712,17 +712,12 @@ impl Task {
 
     /// Handles the messages that have arrived, so that those of an agent that has left, such as the
     /// release of its lock, count before its departure.
-    async fn handle_waiting(&mut self) {
+    fn handle_waiting(&mut self) {
         for _ in 0..MAX_WAITING {
-            let core = Arc::clone(&self.core);
-            let next = core
+            let core = &self.core;
+            let waiting = core
                 .demultiplexer
-                .next_served(&core.endpoint, &self.messages);
-            let waiting = tokio::select! {
-                biased;
-                received = next => received.ok(),
-                () = std::future::ready(()) => None,
-            };
+                .now_served(&core.endpoint, &self.messages);
             match waiting {
                 Some(incoming) => self.handle(&incoming),
                 None => return,

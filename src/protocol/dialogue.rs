@@ -195,6 +195,8 @@ pub(crate) struct Dialogue {
     key: ReaderKey,
     partners: PartnerWatch,
     reachability: ReachabilitySender,
+    /// An agent that is gone, until this is returned.
+    gone: Option<String>,
     /// Number of followed `reply-to` names.
     delegates: usize,
 }
@@ -308,6 +310,7 @@ impl Dialogue {
             speaker,
             partners,
             reachability: ReachabilitySender::default(),
+            gone: None,
             delegates: 0,
         }
     }
@@ -495,14 +498,17 @@ impl Dialogue {
     ) -> Result<Incoming, DialogueError> {
         loop {
             let core = &self.speaker.core;
-            if let Some(agent) = self.partners.all_gone() {
-                let agent = agent.to_owned();
+            let all_gone = || self.partners.all_gone().map(str::to_owned);
+            if let Some(agent) = self.gone.clone().or_else(all_gone) {
+                // A message that has arrived precedes the end of its sender, also one that another task has in hand.
                 let left = core.demultiplexer.now_of(&core.endpoint, &self.key);
+                if left.is_none() {
+                    self.gone = None;
+                }
                 return left.ok_or(DialogueError::Gone { agent });
             }
             let until = due.unwrap_or_else(Instant::now);
             tokio::select! {
-                // A message that has arrived precedes the end of its sender.
                 biased;
                 received = core.demultiplexer.next_of(&core.endpoint, &self.key) => {
                     return received.map_err(DialogueError::Receive);
@@ -510,7 +516,7 @@ impl Dialogue {
                 event = self.partners.next() => {
                     self.reachability.set(self.partners.unreachable());
                     match event {
-                        PartnerEvent::Gone { agent } => return Err(DialogueError::Gone { agent }),
+                        PartnerEvent::Gone { agent } => self.gone = Some(agent),
                         PartnerEvent::Unreachable { agent, since } => {
                             log_limit::warn!(of: &*agent, agent = %escape_name(&agent), "the host of an agent is silent");
                             if silence == Silence::Ends {

@@ -59,6 +59,8 @@ impl Agent {
     /// # }
     /// ```
     ///
+    /// The further messages of the initiator go to the task, also those that wait for [`receive`](Agent::receive).
+    ///
     /// # Errors
     /// If the message does not begin a known protocol ([`DialogueError::NotOpening`] or
     /// [`DialogueError::Unchecked`]), for example because it is an answer.

@@ -27,7 +27,8 @@ impl Agent {
     ///
     /// Conversations about the actions and topics of the agent go to those, and not to the handler.
     ///
-    /// Messages that have arrived before this call, and that the application has not received, go to the handler, too.
+    /// Messages that have arrived before this call and that the application has not received go to the handler, too,
+    /// however old they are.
     ///
     /// The other messages go to [`receive`](Self::receive). If the application never calls `receive`,
     /// the earliest of 1,024 unread messages is dropped, with a warning in the log.

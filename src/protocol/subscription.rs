@@ -517,7 +517,8 @@ impl Subscription {
     }
 
     /// Returns the notifications per second, by the numbers and times of the last ones that [`next`](Self::next)
-    /// returned. `None` if they have one time, which is in milliseconds, and if the publisher does not number them.
+    /// returned. `None` before the second one, if all were published in the same millisecond, and if the publisher does
+    /// not number them.
     #[must_use]
     pub fn rate(&self) -> Option<f64> {
         let ((first, from), (last, to)) = (self.last.front()?, self.last.back()?);

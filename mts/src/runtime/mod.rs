@@ -586,15 +586,22 @@ impl Mts {
             return;
         };
         let is_over = || {
-            if waiter.ready.load(Ordering::Acquire) {
-                return Some(());
-            }
-            waiter.gone.load(Ordering::Acquire).then(|| {
+            let is_gone = waiter.gone.load(Ordering::Acquire);
+            if is_gone {
                 // Other tasks may be about to wait too, and each notification wakes one.
                 waiter.notify.notify_one();
-            })
+            }
+            (is_gone || waiter.ready.load(Ordering::Acquire)).then_some(())
         };
         self.shared.wait(&waiter.notify, is_over).await;
+    }
+
+    /// Whether no more letters can arrive for this agent, because it was deregistered or the service closed.
+    #[must_use]
+    pub fn is_gone(&self, agent: Incarnation) -> bool {
+        let state = self.shared.lock();
+        let waiter = state.agents.get(&agent);
+        waiter.is_none_or(|waiter| waiter.gone.load(Ordering::Acquire))
     }
 
     /// Waits until no more letters can arrive for this agent, because it was deregistered or the
