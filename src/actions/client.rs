@@ -247,6 +247,7 @@ impl<'a> Robot<'a> {
             goal,
             ask,
             request: request.await?,
+            was_silent: false,
             earlier: Vec::new(),
         })
     }
@@ -288,6 +289,8 @@ pub struct GoalHandle<'a> {
     goal: Goal,
     ask: Ask,
     request: Request,
+    /// Whether the host of the robot was silent since the robot was asked last.
+    was_silent: bool,
     /// Those before the host of the robot was silent. Their late answers are not for the application.
     earlier: Vec<Request>,
 }
@@ -344,6 +347,7 @@ impl GoalHandle<'_> {
             ask,
             language: robot.language,
             timeout: robot.timeout(),
+            is_over: false,
             subscription: Some(subscription),
         })
     }
@@ -367,17 +371,18 @@ impl GoalHandle<'_> {
     pub async fn outcome(&mut self) -> Result<Option<Term<'static>>, ActionError> {
         let mut reachability = self.request.reachability();
         let message = loop {
-            let was_silent = !reachability.unreachable().is_empty();
-            tokio::select! {
-                biased;
-                message = self.request.result() => break message?,
-                true = reachability.changed() => {}
-            }
-            if was_silent && reachability.unreachable().is_empty() {
+            if self.was_silent && reachability.unreachable().is_empty() {
                 let again = self.robot.send(self.goal.clone()).await?.request;
                 reachability = again.reachability();
                 self.earlier
                     .push(std::mem::replace(&mut self.request, again));
+                self.was_silent = false;
+            }
+            self.was_silent |= !reachability.unreachable().is_empty();
+            tokio::select! {
+                biased;
+                message = self.request.result() => break message?,
+                true = reachability.changed() => {}
             }
         };
         match read(self.robot.language, &self.ask, &message)? {
@@ -411,7 +416,9 @@ pub struct ProgressUpdates {
     ask: Ask,
     language: &'static dyn Language,
     timeout: Duration,
-    /// `None` after the end of the goal.
+    /// Whether the last status was that of the end of the goal.
+    is_over: bool,
+    /// `None` after the end of the subscription.
     subscription: Option<Subscription>,
 }
 
@@ -425,18 +432,21 @@ impl ProgressUpdates {
         let Some(subscription) = &mut self.subscription else {
             return Ok(None);
         };
-        let message = subscription.next().await?;
-        let ActionAnswer::Status(mut all) = read(self.language, &self.ask, &message)? else {
-            return Err(LanguageError::Form("a status").into());
-        };
-        let status = all.pop();
-        if status.as_ref().is_none_or(|status| status.state.is_over())
-            && let Some(mut ended) = self.subscription.take()
-        {
-            // The robot ends the subscription.
-            let _ = tokio::time::timeout(self.timeout, ended.next()).await;
+        if !self.is_over {
+            let message = subscription.next().await?;
+            let ActionAnswer::Status(mut all) = read(self.language, &self.ask, &message)? else {
+                return Err(LanguageError::Form("a status").into());
+            };
+            let status = all.pop();
+            self.is_over = status.as_ref().is_none_or(|status| status.state.is_over());
+            if status.is_some() {
+                return Ok(status);
+            }
         }
-        Ok(status)
+        // The robot ends the subscription.
+        let _ = tokio::time::timeout(self.timeout, subscription.next()).await;
+        self.subscription = None;
+        Ok(None)
     }
 }
 

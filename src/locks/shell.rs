@@ -109,14 +109,15 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<Arc<Shared>, LockError> {
         changed: Notify::new(),
         algorithm,
     });
+    let is_of_locks = Box::new(lock_slot::is_of_locks);
+    // Before the first letter is sent, so that no answer is missed.
+    let messages = core.demultiplexer.serve_all(is_of_locks, Precedence::Part);
     slot.running = Some(Arc::clone(&shared) as Arc<dyn RunningLocks>);
     drop(slot);
     meet_neighbors(core, &me, &shared);
     let task = Task {
-        // From here on, no message and no change of the directory is missed.
-        messages: core
-            .demultiplexer
-            .serve_all(Box::new(lock_slot::is_of_locks), Precedence::Part),
+        messages,
+        // From here on, no change of the directory is missed.
         changes: Some(endpoint.domain.directory().watch()),
         partners: PartnerWatch::new(Arc::clone(core)),
         watched: HashSet::new(),

@@ -42,32 +42,48 @@ class _Workers:
         self._calls: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = queue.SimpleQueue()
         self._idle = threading.Semaphore(0)
         self._count = 0
+        self._is_closed = False
+        self._lock = threading.Lock()
 
     def submit(self, call: Callable[[], Any]) -> Future[Any]:
-        """Has a thread call a function. One thread calls this method."""
+        """Has a thread call a function."""
         result: Future[Any] = Future()
-        self._calls.put((result, call))
-        if not self._idle.acquire(blocking=False) and self._count < _MAX_WORKERS:
-            self._count += 1
-            threading.Thread(target=self._work, name="fipa-handler", daemon=True).start()
+        with self._lock:
+            if self._is_closed:
+                # The conversation was taken before the end. The other threads may have ended.
+                self._start(_call_for, result, call)
+                return result
+            self._calls.put((result, call))
+            if not self._idle.acquire(blocking=False) and self._count < _MAX_WORKERS:
+                self._count += 1
+                self._start(self._work)
         return result
 
     def close(self) -> None:
         """Has the threads end after the calls that were submitted."""
-        self._calls.put(None)
+        with self._lock:
+            self._is_closed = True
+            self._calls.put(None)
+
+    @staticmethod
+    def _start(target: Callable[..., None], *arguments: Any) -> None:
+        threading.Thread(target=target, args=arguments, name="fipa-handler", daemon=True).start()
 
     def _work(self) -> None:
         while (submitted := self._calls.get()) is not None:
-            result, call = submitted
-            if result.set_running_or_notify_cancel():
-                try:
-                    result.set_result(call())
-                except BaseException as error:
-                    result.set_exception(error)
-            del result, call, submitted
+            _call_for(*submitted)
+            del submitted
             self._idle.release()
         # For the next thread.
         self._calls.put(None)
+
+
+def _call_for(result: Future[Any], call: Callable[[], Any]) -> None:
+    if result.set_running_or_notify_cancel():
+        try:
+            result.set_result(call())
+        except BaseException as error:
+            result.set_exception(error)
 
 
 class Server:
@@ -81,14 +97,16 @@ class Server:
         #: The handler, so that a decorated function can be called.
         self.__wrapped__ = handler
         self.__name__ = getattr(handler, "__name__", "handler")
+        self._thread: threading.Thread | None = None
+
+    def _start(self) -> None:
+        """Begins to call the handler, which may use this server at once."""
         try:
             loop = asyncio.get_running_loop()
         except RuntimeError:
-            self._thread: threading.Thread | None = threading.Thread(target=self._follow, name="fipa-server")
-            self._thread.daemon = True
+            self._thread = threading.Thread(target=self._follow, name="fipa-server", daemon=True)
             self._thread.start()
         else:
-            self._thread = None
             self._task = loop.create_task(self._follow_in_loop())
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
@@ -186,6 +204,7 @@ def serve(agent: Agent, protocol: str, handler: Callable[[Task], Any] | None) ->
                 await task.inform("" if result is None else result)
 
     server = Server(agent.tasks(protocol), handle, handler)
+    server._start()
     return server
 
 
@@ -212,6 +231,7 @@ def action(agent: Agent, function: Callable[..., Any] | None, name: str | None, 
                 goal.fail(goal.stop_reason)
 
     server = Server(agent.goals(_description(function, name, policy)), pursue, function)
+    server._start()
     return server
 
 

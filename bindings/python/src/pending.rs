@@ -139,8 +139,11 @@ impl Pending {
             }
             let waited = py.detach(|| (&mut future).wait_within(slice));
             ready = waited.map_or(Poll::Pending, Poll::Ready);
-            log::deliver(py)?;
-            py.check_signals()?;
+            if ready.is_pending() {
+                // With an output in hand, an exception of these would lose it.
+                log::deliver(py)?;
+                py.check_signals()?;
+            }
         }
     }
 }

@@ -6,6 +6,7 @@ import time
 import unittest
 
 import fipa
+from fipa._serve import _Workers as Workers
 from support import Case, Loops
 
 
@@ -77,6 +78,18 @@ class Conversations(Loops):
         with self.arm.serve("fipa-query", lambda task: b"pose"):
             question = fipa.Message("query-ref", self.arm.name, "pose")
             self.assertEqual(bytes(self.rover.request(question, timeout=30).wait().content), b"pose")
+
+    def test_requests_that_wait_for_a_server_are_answered(self) -> None:
+        for _ in range(10):
+            request = self.rover.begin_request(self.request("crate"), timeout=30)
+            with self.arm.serve("fipa-request", lambda task: "lifted"):
+                self.assertEqual(request.result().wait().text, "lifted")
+
+    def test_a_handler_is_called_for_a_conversation_that_was_taken_before_the_end(self) -> None:
+        workers = Workers()
+        self.assertEqual(workers.submit(lambda: "before").result(timeout=30), "before")
+        workers.close()
+        self.assertEqual(workers.submit(lambda: "after").result(timeout=30), "after")
 
     def test_a_task_that_is_dropped_fails(self) -> None:
         tasks = self.arm.tasks("fipa-request")

@@ -729,8 +729,8 @@ impl Shared {
         let all = locations.iter().flat_map(|(_, of_one)| of_one).cloned();
         let all: Arc<[Location]> = all.collect();
         self.located.send_replace(Arc::clone(&all));
-        drop(locations);
         let own = listened_at(&*all);
+        // Under the lock of the locations, so that the last ones are set last.
         self.state.lock().core.listens_at(own);
     }
 

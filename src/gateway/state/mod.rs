@@ -449,6 +449,8 @@ impl StateFile {
 
     /// Writes the file if something has changed. Blocks.
     pub(super) fn write(&self) {
+        // Before the items are read, so that a writer that is late does not replace later ones.
+        let mut written = self.written.lock();
         let items = self.items(Instant::now());
         let mut head = Head {
             version: VERSION,
@@ -459,7 +461,6 @@ impl StateFile {
         };
         let room = MAX_BYTES - encode(&head, &[]).len();
         let lines = lines(&items, room);
-        let mut written = self.written.lock();
         match &*written {
             None => return,
             Some(written) if *written == lines && self.path.exists() => return,

@@ -201,21 +201,17 @@ impl Recording {
     async fn observe(&mut self, watcher: &mut Watcher, sender: &Sender<Observation>) {
         let mut ticks = tokio::time::interval(TICK);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        loop {
-            let observation = tokio::select! {
-                event = watcher.next() => Observation::Event(event),
+        // Places are taken before observations, so that the end of this future loses none.
+        while let (Ok(first), Ok(second)) = (sender.reserve().await, sender.reserve().await) {
+            tokio::select! {
+                event = watcher.next() => first.send(Observation::Event(event)),
                 _ = ticks.tick() => {
                     self.progress.set_message(self.line());
-                    if let Some(directory) = self.known.changes(watcher)
-                        && sender.send(Observation::Directory(directory)).await.is_err()
-                    {
-                        return;
+                    if let Some(directory) = self.known.changes(watcher) {
+                        first.send(Observation::Directory(directory));
                     }
-                    Observation::Tick
+                    second.send(Observation::Tick);
                 }
-            };
-            if sender.send(observation).await.is_err() {
-                return;
             }
         }
     }

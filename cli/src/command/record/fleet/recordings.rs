@@ -3,7 +3,7 @@
 //! Each recording is written by a process of its own, so that it costs the process of the gateway nothing. That process
 //! ends with its standard input, also if the gateway is killed.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Read};
@@ -273,13 +273,15 @@ impl Recordings {
     pub(super) async fn list(self: &Arc<Self>) -> Result<Listing, RecordingsError> {
         let this = Arc::clone(self);
         blocking(move || {
+            // The length of a recording that ends meanwhile is not final.
+            let earlier: BTreeSet<_> = this.running.lock().keys().cloned().collect();
             let mut stored = this.stored()?;
             // The newest ones.
             stored.sort_by_key(|it| std::cmp::Reverse(it.modified));
             stored.truncate(MAX_LISTED);
             let running = this.running.lock();
             let recordings = stored.into_iter().map(|it| Recording {
-                state: match running.contains_key(&it.name) {
+                state: match earlier.contains(&it.name) || running.contains_key(&it.name) {
                     true => State::Recording,
                     false => State::Finished,
                 },
