@@ -250,7 +250,12 @@ enum Taken {
     SetAside,
     /// No letter has arrived.
     Nothing,
+    /// A queue is full.
+    NoRoom,
 }
+
+/// Whether each queue has room for a further message.
+struct HasRoom(bool);
 
 impl Demultiplexer {
     /// Starts a queue for a conversation that a call leads.
@@ -477,32 +482,36 @@ impl Demultiplexer {
     ) -> Result<Option<Incoming>, ReceiveError> {
         // Letters for others that go on to arrive do not keep the caller.
         for _ in 0..MAX_SET_ASIDE {
-            let (set_aside, has_room) = self.change(|state| (state.take(reader), state.has_room()));
-            if set_aside.is_some() {
-                return Ok(set_aside);
-            }
-            if !has_room {
-                return if endpoint.is_closed() {
-                    Err(ReceiveError::Closed)
-                } else {
-                    Ok(None)
-                };
-            }
             match self.take(endpoint, reader)? {
                 Taken::Own(own) => return Ok(Some(own)),
                 Taken::SetAside => {}
-                Taken::Nothing => return Ok(None),
+                Taken::NoRoom if endpoint.is_closed() => return Err(ReceiveError::Closed),
+                Taken::Nothing | Taken::NoRoom => return Ok(None),
             }
         }
         Ok(None)
     }
 
-    /// Takes the next letter of the agent, and hands it to its reader.
+    /// Returns the next message of a reader that is set aside.
+    fn take_set_aside(&self, reader: Reader<'_>) -> Result<Incoming, HasRoom> {
+        let mut state = self.state.lock();
+        if state.queue(reader).is_none_or(|queue| queue.is_empty()) {
+            // A program that polls an empty queue pays for nothing else.
+            state.is_read |= matches!(reader, Reader::Others);
+            return Err(HasRoom(state.has_room()));
+        }
+        drop(state);
+        self.change(|state| state.take(reader).ok_or_else(|| HasRoom(state.has_room())))
+    }
+
+    /// Returns the next message of the caller that is set aside, or takes the next letter of the agent and hands it to its
+    /// reader.
     fn take(&self, endpoint: &Endpoint, caller: Reader<'_>) -> Result<Taken, ReceiveError> {
         let _in_order = self.taking.lock();
-        // Another reader may have set it aside while this one waited for the lock.
-        if let Some(own) = self.change(|state| state.take(caller)) {
-            return Ok(Taken::Own(own));
+        match self.take_set_aside(caller) {
+            Ok(own) => return Ok(Taken::Own(own)),
+            Err(HasRoom(false)) => return Ok(Taken::NoRoom),
+            Err(HasRoom(true)) => {}
         }
         let Some(received) = endpoint.letter_now()? else {
             return Ok(Taken::Nothing);

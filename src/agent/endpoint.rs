@@ -169,8 +169,10 @@ impl Endpoint {
 
     /// Returns the next letter, if one is available now.
     pub(crate) fn letter_now(&self) -> Result<Option<Received>, ReceiveError> {
-        let received = self.mts().try_receive(self.incarnation);
-        received.map_err(|Gone| ReceiveError::Closed)
+        match self.mts().try_receive(self.incarnation) {
+            Ok(received) => Ok(received),
+            Err(Gone) => Err(ReceiveError::Closed),
+        }
     }
 
     /// Whether no more letters can arrive.
