@@ -238,8 +238,8 @@ enum Reader<'a> {
     Conversation(&'a ReaderKey),
     Server(&'a ReaderKey),
     Others,
-    /// The caller only hands a message over.
-    Nobody,
+    /// None: the caller only hands a message over.
+    Absent,
 }
 
 /// The next letter of an agent.
@@ -602,7 +602,7 @@ impl State {
 
     /// Adds a message to the queue of its reader, which is another one than when it arrived.
     fn put_again(&mut self, message: Incoming) {
-        let own = self.put(message, None, Reader::Nobody);
+        let own = self.put(message, None, Reader::Absent);
         debug_assert!(own.is_none(), "the caller reads nothing");
     }
 
@@ -615,7 +615,7 @@ impl State {
                 Some(&mut server.queue)
             }
             Reader::Others => Some(&mut self.others),
-            Reader::Nobody => None,
+            Reader::Absent => None,
         }
     }
 
@@ -784,7 +784,7 @@ mod tests {
 
     /// Adds a message for a reader other than the caller.
     fn set_aside(state: &mut State, received: Incoming, registered: Option<&Entry>) {
-        let own = state.put(received, registered, Reader::Nobody);
+        let own = state.put(received, registered, Reader::Absent);
         assert!(own.is_none());
     }
 
