@@ -751,7 +751,7 @@ const AGENTS: usize = 1000;
 const LETTERS: usize = 20;
 
 /// The processor time of a process, in seconds.
-fn processor_time(pid: &str) -> f64 {
+fn processor_time(pid: u32) -> f64 {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
     let (_, fields) = stat.rsplit_once(')').unwrap();
     let fields: Vec<&str> = fields.split_whitespace().collect();
@@ -820,7 +820,7 @@ fn soak() {
          list.getEntries().forEach((entry) => window.long.push(entry.duration))).observe({ type: 'longtask' }); })()",
     );
     let pid = shown.gateway.pid();
-    let (started, before) = (std::time::Instant::now(), processor_time(&pid));
+    let (started, before) = (std::time::Instant::now(), processor_time(pid));
     let mut first = None;
     let minutes = std::env::var("FIPA_SOAK").map_or(SOAK, |minutes| minutes.parse().unwrap());
     for minute in 1..=minutes {
@@ -828,7 +828,7 @@ fn soak() {
         let heap = heap(&browser);
         let first = *first.get_or_insert(heap);
         let long = browser.value("Math.max(0, ...window.long)");
-        let load = (processor_time(&pid) - before) / started.elapsed().as_secs_f64();
+        let load = (processor_time(pid) - before) / started.elapsed().as_secs_f64();
         println!(
             "minute {minute}: {:.0} % of a core, heap {:.1} MB ({:.2} of the first), longest task {long} ms, {}",
             100.0 * load,

@@ -4,13 +4,11 @@
 
 mod common;
 
-use std::collections::HashMap;
-use std::ffi::OsString;
-use std::fs;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use common::Host;
+use fipa_testbed::Waits;
 
 /// A test that never finds its processes idle fails after this time.
 const WATCHDOG: Duration = Duration::from_secs(60);
@@ -27,17 +25,10 @@ fn idle_processes_do_not_wake_up() {
     let most = [(agent.pid(), 1), (gateway.pid(), 5)];
     let began = Instant::now();
     loop {
-        let before = most.each_ref().map(|(pid, _)| wake_ups(pid));
+        let before = most.each_ref().map(|(pid, _)| Waits::of(*pid));
         thread::sleep(WINDOW);
-        let after = most.each_ref().map(|(pid, _)| wake_ups(pid));
-        let counts = [0, 1].map(|process: usize| {
-            let threads = after[process].iter();
-            let new = threads.map(|(thread, count)| match before[process].get(thread) {
-                Some(earlier) => count - earlier,
-                None => *count,
-            });
-            new.sum::<u64>()
-        });
+        let counts =
+            [0, 1].map(|process: usize| Waits::of(most[process].0).since(&before[process]));
         if counts
             .iter()
             .zip(&most)
@@ -47,18 +38,4 @@ fn idle_processes_do_not_wake_up() {
         }
         assert!(began.elapsed() < WATCHDOG, "wake-ups: {counts:?}");
     }
-}
-
-/// The number of times that each thread of a process waited.
-fn wake_ups(pid: &str) -> HashMap<OsString, u64> {
-    let threads = fs::read_dir(format!("/proc/{pid}/task")).unwrap();
-    let counts = threads.filter_map(|thread| {
-        let thread = thread.unwrap();
-        // The thread may end meanwhile.
-        let status = fs::read_to_string(thread.path().join("status")).ok()?;
-        let mut lines = status.lines();
-        let count = lines.find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"))?;
-        Some((thread.file_name(), count.trim().parse().unwrap()))
-    });
-    counts.collect()
 }

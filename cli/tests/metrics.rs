@@ -16,7 +16,7 @@ use common::Host;
 use fipa::blocking::Wait;
 use fipa::config::Sources;
 use fipa::{Agent, Config, Domain, Kind, Message, Performative};
-use fipa_testbed::until;
+use fipa_testbed::{Waits, until};
 use listener::Shown;
 
 /// Timeout for hanging tests.
@@ -255,19 +255,6 @@ fn letters_for_another_host_are_queued_there_or_under_way_here_over_ipv6() {
     letters_wait_at_another_host("[::1]");
 }
 
-/// The number of times that the threads of a process have waited.
-fn waits(pid: &str) -> u64 {
-    let tasks = fs::read_dir(format!("/proc/{pid}/task")).unwrap();
-    let of_task = |task: fs::DirEntry| -> u64 {
-        let status = fs::read_to_string(task.path().join("status")).unwrap();
-        let line = status
-            .lines()
-            .find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"));
-        line.unwrap().trim().parse().unwrap()
-    };
-    tasks.map(|task| of_task(task.unwrap())).sum()
-}
-
 #[test]
 fn a_question_for_metrics_wakes_no_other_process() {
     const QUESTIONS: u64 = 200;
@@ -275,11 +262,11 @@ fn a_question_for_metrics_wakes_no_other_process() {
     let shown = shown(&host, "127.0.0.1:0", &[]);
     let echo = host.echo("echo");
     host.run(&["ping", "echo", "--count", "1"]).done();
-    let before = waits(&echo.pid());
+    let before = Waits::of(echo.pid());
     for _ in 0..QUESTIONS {
         shown.values();
     }
-    let waited = waits(&echo.pid()) - before;
+    let waited = Waits::of(echo.pid()).since(&before);
     // The process has work of its own from time to time.
     assert!(
         waited < QUESTIONS / 2,

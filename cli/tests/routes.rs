@@ -76,10 +76,9 @@ fn a_receiver_whose_process_is_stopped_is_named() {
     );
     assert_eq!(routes.matches(&stopped).count(), 1, "{routes}");
     let in_json = host.run(&["routes", "arm", "--json"]).done_json();
-    let process: u32 = pid.parse().unwrap();
     assert_eq!(
         in_json["stopped"],
-        json!([{ "receiver": "arm", "process": process }])
+        json!([{ "receiver": "arm", "process": pid }])
     );
     arm.send_signal("-CONT");
 }

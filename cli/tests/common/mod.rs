@@ -329,8 +329,8 @@ impl Running {
     }
 
     /// Its process identifier.
-    pub(crate) fn pid(&self) -> String {
-        self.child.id().to_string()
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
     }
 
     /// Sends a signal, waits for the end, and returns the exit code and standard error.

@@ -63,7 +63,7 @@ fn pages_that_never_read_cost_bounded_memory() {
         send(10);
         newest() >= 200
     });
-    let pid: u32 = shown.gateway.pid().parse().unwrap();
+    let pid = shown.gateway.pid();
     let mut before = 0;
     until("the gateway does not grow any more", || {
         send(LETTERS);

@@ -1,5 +1,7 @@
 //! Processes that tests start.
 
+use std::collections::HashMap;
+use std::ffi::OsString;
 use std::fs;
 use std::io::{self, BufRead as _, BufReader, Read as _};
 use std::process::{Child, ChildStderr, Command, ExitStatus, Stdio};
@@ -44,6 +46,42 @@ pub fn private_memory(process: u32) -> u64 {
     let mut lines = status.lines();
     let kib = lines.find_map(|line| line.strip_prefix("RssAnon:")?.strip_suffix(" kB"));
     kib.unwrap().trim().parse::<u64>().unwrap() << 10
+}
+
+/// How often each thread of a process has waited.
+#[derive(Debug)]
+pub struct Waits(HashMap<OsString, u64>);
+
+impl Waits {
+    /// Reads the counts of a process.
+    ///
+    /// # Panics
+    /// If there is no such process.
+    #[must_use]
+    #[track_caller]
+    pub fn of(process: u32) -> Self {
+        let threads = fs::read_dir(format!("/proc/{process}/task")).unwrap();
+        let counts = threads.flatten().filter_map(|thread| {
+            // The thread may end meanwhile.
+            let status = fs::read_to_string(thread.path().join("status")).ok()?;
+            let mut lines = status.lines();
+            let count = lines.find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"))?;
+            Some((thread.file_name(), count.trim().parse().unwrap()))
+        });
+        Self(counts.collect())
+    }
+
+    /// Returns how often the threads that are here have waited since these earlier counts. The waits of a thread
+    /// that has ended since then are not known.
+    #[must_use]
+    pub fn since(&self, earlier: &Self) -> u64 {
+        let new = self.0.iter().map(|(thread, count)| {
+            let before = earlier.0.get(thread).copied().unwrap_or(0);
+            // Another thread may have got the number of one that has ended.
+            count.checked_sub(before).unwrap_or(*count)
+        });
+        new.sum()
+    }
 }
 
 /// Whether no thread of the process runs.

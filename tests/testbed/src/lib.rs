@@ -46,7 +46,7 @@ use std::path::PathBuf;
 use std::process::Command;
 
 pub use avahi::Avahi;
-pub use child::{ChildGuard, ignored_test, private_memory, send_signal};
+pub use child::{ChildGuard, Waits, ignored_test, private_memory, send_signal};
 pub use http_requests::hostile_requests;
 pub use network::{Family, Host, Network};
 pub use packet_repeater::PacketRepeater;
