@@ -98,7 +98,7 @@ async fn a_name_belongs_to_one_agent_at_a_time() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_thousand_letters_arrive_in_order_and_once() {
-    let config = config(&["mts.queue=16"]);
+    let config = config(&["mts.queue=16", "mts.deadline=2min"]);
     let (here, there) = two(&config).await;
     let (rover, arm) = (
         here.register("rover").await.unwrap(),
@@ -109,7 +109,7 @@ async fn a_thousand_letters_arrive_in_order_and_once() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn letters_stay_in_order_while_several_tasks_of_their_receiver_wait() {
-    let config = config(&[]);
+    let config = config(&["mts.deadline=2min"]);
     let (here, there) = two(&config).await;
     let (rover, arm) = (
         here.register("rover").await.unwrap(),
@@ -184,7 +184,7 @@ async fn a_full_queue_fails_at_the_deadline_and_does_not_block_other_receivers()
                 .all_succeeded()
         );
     }
-    let short = Duration::from_millis(300);
+    let short = Duration::from_secs(2);
     let blocked = rover.send_within(inform(&rover, "slow", "too much"), short);
     let meanwhile = async {
         for _ in 0..20 {

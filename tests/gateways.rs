@@ -183,7 +183,7 @@ async fn a_slow_agent_on_another_host_holds_its_sender_back() {
     for _ in 0..2 {
         via(&rover.send(inform(&rover, arm.name(), "x")).await.unwrap());
     }
-    let short = Duration::from_secs(1);
+    let short = Duration::from_secs(5);
     let late = rover
         .send_within(inform(&rover, arm.name(), "late"), short)
         .await
@@ -201,7 +201,7 @@ async fn a_slow_agent_on_another_host_holds_its_sender_back() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn agents_of_one_host_exchange_letters_without_their_gateway() {
-    let (here, there) = (Host::new(&["mts.deadline=2s"]), Host::new(&[]));
+    let (here, there) = (Host::new(&["mts.deadline=60s"]), Host::new(&[]));
     let near = Gateway::open(&here.config).await.unwrap();
     let _far = Gateway::open(&there.config).await.unwrap();
     let (at_home, next_door, abroad) = (
@@ -318,12 +318,13 @@ async fn the_gateway_reports_the_routes_of_letters_and_their_state() {
     let rover = at_home.register(&here.name("rover")).await.unwrap();
     let arm = abroad.register(&there.name("arm")).await.unwrap();
     known(&at_home, arm.name()).await;
+    let timeout = Duration::from_secs(30);
     for _ in 0..5 {
-        via(&rover.send(inform(&rover, arm.name(), "x")).await.unwrap());
+        let letter = inform(&rover, arm.name(), "x");
+        via(&rover.send_within(letter, timeout).await.unwrap());
     }
     let asker = at_home.register(&here.name("asker")).await.unwrap();
     let gateway = at_home.directory().lookup(near.name()).unwrap();
-    let timeout = Duration::from_secs(30);
     let ask = || routes::of_gateway(&asker, &gateway, Some(arm.name()), timeout);
 
     let report = ask().await.unwrap();

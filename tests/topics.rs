@@ -268,16 +268,21 @@ async fn a_stopped_viewer_of_all_images_delays_the_camera_and_its_images_fail_in
             result => assert!(result.is_success(), "{result:?}"),
         }
     }
-    // One was under way, and 64 waited.
-    assert_eq!(too_slow, 15);
-    for number in 1..=65 {
+    // One was under way, and 64 waited. On a busy machine, the first one leaves late.
+    assert!(matches!(too_slow, 15 | 16), "{too_slow}");
+    let (mut last, mut missed) = (0, 0);
+    for _ in 0..80 - too_slow {
         let seen = stopped.seen();
-        assert_eq!((seen.number, seen.missed), (number, 0));
+        assert_eq!(seen.number, last + 1 + seen.missed);
+        last = seen.number;
+        missed += seen.missed;
     }
+    assert!(last >= 64, "{last}");
     let last = camera.publish(vec![81; 10]).await;
     assert_eq!(last.delivered().await, 1);
     let seen = stopped.seen();
-    assert_eq!((seen.number, seen.missed, seen.fill), (81, 15, 81));
+    assert_eq!((seen.number, seen.fill), (81, 81));
+    assert_eq!(missed + seen.missed, too_slow);
     // The domain that closes last removes the files of a process that was killed.
     drop(stopped);
     domain.close().await;

@@ -100,7 +100,7 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
             .starts_with(&format!("admitted with {stale}: (request"))
     );
 
-    let late = host.run(&["lock", "bay", "--within", "300ms", "--", "true"]);
+    let late = host.run(&["lock", "bay", "--within", "3s", "--", "true"]);
     let late = late.failed(124);
     let problem = "timed out waiting for \"bay\", with 1 request ahead\nwhere: resource \"bay\", held by \"rover\"";
     assert!(late.contains(problem), "{late}");
@@ -230,7 +230,7 @@ fn the_end_of_a_command_is_reported_as_a_release() {
 #[test]
 fn the_command_is_ended_when_the_lock_is_lost() {
     let host = Host::new();
-    let crane = own(&host, &["--lease", "1s"]);
+    let crane = own(&host, &["--lease", "3s"]);
     let script = "trap 'echo ended; exit 0' TERM; echo $FIPA_FENCE $$; while :; do sleep 0.1; done";
     let (mut holder, _, process) = hold(&host, &[], script);
     crane.signal("-KILL");
@@ -240,7 +240,7 @@ fn the_command_is_ended_when_the_lock_is_lost() {
     assert!(log.contains("the lock of \"bay\" was lost"), "{log}");
     assert!(!process.is_running());
 
-    let crane = own(&host, &["--lease", "1s"]);
+    let crane = own(&host, &["--lease", "3s"]);
     let stubborn = "trap '' TERM; echo $FIPA_FENCE $$; while :; do sleep 0.1; done";
     let (mut stubborn, _, process) = hold(&host, &["--kill-after", "500ms"], stubborn);
     drop(crane);
@@ -248,7 +248,7 @@ fn the_command_is_ended_when_the_lock_is_lost() {
     assert_eq!(code, Some(125), "{log}");
     until("SIGKILL ends the command", || !process.is_running());
 
-    let crane = own(&host, &["--lease", "1s"]);
+    let crane = own(&host, &["--lease", "3s"]);
     let script = "echo $FIPA_FENCE $$; while [ ! -e go ]; do sleep 0.1; done; exit 3";
     let (mut holder, _, _process) = hold(&host, &["--keep"], script);
     crane.signal("-KILL");

@@ -321,7 +321,7 @@ fn a_cut_file_is_read_to_its_last_complete_chunk() {
     let recording = record(&host, &["-o", text(&path), "--sync", "1ms"]);
     send(
         &host,
-        "send --from rover --to arm_1 --content hello --rate 200 --count 60 --numbered",
+        "send --from rover --to arm_1 --content hello --rate 200 --count 200 --numbered",
     );
     end(recording);
     let file = fs::read(&path).unwrap();
@@ -765,7 +765,7 @@ fn an_abandoned_lock_is_in_the_log() {
     ]);
     let fence = holder.ready.trim().to_owned();
     let late = [
-        "lock", "bay", "--agent", "loader", "--within", "300ms", "--", "true",
+        "lock", "bay", "--agent", "loader", "--within", "3s", "--", "true",
     ];
     assert_eq!(host.run(&late).code, Some(124));
     holder.send_signal("-TERM");

@@ -361,9 +361,17 @@ fn a_successor_has_what_agents_told(family: Family) {
     }
     until("both hosts know all", || {
         let all = pair.all();
-        let both = [&all[0], &all[5]];
-        let mut shown = both.iter().map(|it| it.as_deref().unwrap_or_default());
-        shown.all(|it| it.contains("arm0") && it.contains("arm1"))
+        let knows = |shown: usize, names: &[&str]| {
+            let shown = all[shown].as_deref().unwrap_or_default();
+            [0, 1].iter().all(|at| {
+                let mut names = names.iter().map(|name| format!("{name}{at}"));
+                names.all(|name| shown.contains(&name))
+            })
+        };
+        let agents = ["arm", "echo", "robot-host", "crane"];
+        [0, 5]
+            .iter()
+            .all(|df| knows(*df, &["arm"]) && knows(df + 4, &agents))
     });
     let before = pair.all();
     assert!(before.iter().all(Option::is_some), "{before:#?}");

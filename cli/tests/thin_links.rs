@@ -179,11 +179,14 @@ fn small_letters_arrive_before_large_ones(family: Family) {
             run(fipa(at, &words))
         });
         for _ in 0..2 {
-            for (at, to) in [(0, "echo1"), (1, "echo0")] {
+            let small = [(0, "echo1"), (1, "echo0")].map(|(at, to)| {
                 let words = ["send", "--to", to, "--content", "stop", "--wait"];
-                let sent = fipa(at, &words).output().unwrap();
+                run(fipa(at, &words))
+            });
+            for sent in small {
+                let sent = sent.wait_with_output().unwrap();
                 let errors = String::from_utf8_lossy(&sent.stderr);
-                assert!(sent.status.success(), "from host {at}: {errors}");
+                assert!(sent.status.success(), "{errors}");
             }
         }
         for sender in &mut large {

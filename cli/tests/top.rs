@@ -27,7 +27,7 @@ fn rover(host: &Host) -> ChildGuard {
         "--rate",
         "50",
     ];
-    ChildGuard::start(host.command(&rover).stdout(Stdio::null()))
+    ChildGuard::until_ready(&mut host.command(&rover)).0
 }
 
 /// Sends one letter to an agent that does not exist.

@@ -321,6 +321,7 @@ impl GoalHandle<'_> {
     /// goal.
     pub async fn accepted(&mut self) -> Result<(), ActionError> {
         let goal = GoalRef::from(self.id());
+        let mut is_over = false;
         loop {
             let agreed = self.request.agreed();
             if let Ok(agreed) = tokio::time::timeout(self.robot.timeout(), agreed).await {
@@ -328,8 +329,11 @@ impl GoalHandle<'_> {
                 return Ok(());
             }
             let status = self.robot.status_of(goal.clone()).await;
-            if !status.is_ok_and(|status| !status.state.is_over()) {
-                return Err(ActionError::Dialogue(DialogueError::TimedOut));
+            match status {
+                Ok(status) if !status.state.is_over() => {}
+                // The answer to the goal is under way.
+                Ok(_) if !is_over => is_over = true,
+                _ => return Err(ActionError::Dialogue(DialogueError::TimedOut)),
             }
         }
     }

@@ -260,11 +260,9 @@ impl Agent {
         });
         let name = description.name.clone();
         let table = self.core.actions.clone();
-        let is_first = table.offer(description, options, run)?;
+        table.offer(description, options, run)?;
         let offer = Offer { table, name };
-        if is_first {
-            server::start(&self.core)?;
-        }
+        server::start(&self.core)?;
         Ok(offer)
     }
 }

@@ -17,8 +17,13 @@ use crate::protocol::{DialogueError, Reply, Task, serve_those};
 /// Minimum time between two notifications of a subscription to all goals.
 const STATUS_INTERVAL: std::time::Duration = std::time::Duration::from_millis(100);
 
-/// Starts the servers of an agent that offers its first action.
+/// Starts the servers of an agent, unless they run.
 pub(super) fn start(core: &Arc<AgentCore>) -> Result<(), DialogueError> {
+    let runtime = &core.endpoint.domain.inner.service.runtime;
+    core.actions.serve(runtime, || servers(core))
+}
+
+fn servers(core: &Arc<AgentCore>) -> Result<Vec<Box<dyn Any + Send>>, DialogueError> {
     let is_about_actions = |message: &Message| message.ontology() == Some(ONTOLOGY);
     let mut servers: Vec<Box<dyn Any + Send>> = Vec::new();
     for (protocol, part) in [
@@ -41,9 +46,7 @@ pub(super) fn start(core: &Arc<AgentCore>) -> Result<(), DialogueError> {
         let server = serve_those(core, protocol, is_about_actions, handler)?;
         servers.push(Box::new(server));
     }
-    let runtime = &core.endpoint.domain.inner.service.runtime;
-    core.actions.keep(servers, runtime);
-    Ok(())
+    Ok(servers)
 }
 
 #[derive(Debug, Clone, Copy)]

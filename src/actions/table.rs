@@ -50,6 +50,8 @@ pub(crate) struct ActionTable(Arc<Shared>);
 #[derive(Default)]
 struct Shared {
     state: Mutex<State>,
+    /// What runs from the first offer until the end of the agent. Its lock comes before that of the state.
+    serving: Mutex<Option<Serving>>,
     /// Notified when a timer is set that is due before the others.
     armed: Notify,
 }
@@ -68,9 +70,18 @@ struct State {
     changes: watch::Sender<u64>,
     /// Number of subscriptions, by client.
     subscriptions: HashMap<String, usize>,
-    /// The servers of the agent, as soon as it offers an action.
-    servers: Vec<Box<dyn Any + Send>>,
-    timers: Option<AbortHandle>,
+}
+
+/// The servers and the timers of an agent that offers actions. They end when it is dropped.
+struct Serving {
+    _servers: Vec<Box<dyn Any + Send>>,
+    timers: AbortHandle,
+}
+
+impl Drop for Serving {
+    fn drop(&mut self) {
+        self.timers.abort();
+    }
 }
 
 struct Task {
@@ -90,8 +101,6 @@ impl Default for State {
             watched: HashMap::new(),
             changes: watch::Sender::new(0),
             subscriptions: HashMap::new(),
-            servers: Vec::new(),
-            timers: None,
         }
     }
 }
@@ -180,42 +189,43 @@ impl ActionTable {
         })
     }
 
-    /// Adds an action. Returns whether the agent has no servers yet.
+    /// Adds an action.
     pub(crate) fn offer(
         &self,
         description: ActionDescription,
         options: OfferOptions,
         handler: Handler,
-    ) -> Result<bool, OfferRefused> {
+    ) -> Result<(), OfferRefused> {
         let mut state = self.0.state.lock();
         let name = description.name.clone();
         state.executor.offer(description, options)?;
         state.handlers.insert(name, handler);
-        Ok(state.servers.is_empty())
+        Ok(())
     }
 
-    /// Keeps the servers of the agent, and starts the timers.
-    pub(crate) fn keep(&self, servers: Vec<Box<dyn Any + Send>>, runtime: &Handle) {
-        let shared = Arc::clone(&self.0);
-        let timers = runtime.spawn(run_timers(Self(shared))).abort_handle();
-        let mut state = self.0.state.lock();
-        state.servers = servers;
-        state.timers = Some(timers);
+    /// Starts the servers of the agent, which this function returns, and the timers, unless they run.
+    pub(crate) fn serve<E>(
+        &self,
+        runtime: &Handle,
+        start: impl FnOnce() -> Result<Vec<Box<dyn Any + Send>>, E>,
+    ) -> Result<(), E> {
+        let mut serving = self.0.serving.lock();
+        if serving.is_none() {
+            *serving = Some(Serving {
+                _servers: start()?,
+                timers: runtime.spawn(run_timers(self.clone())).abort_handle(),
+            });
+        }
+        Ok(())
     }
 
     /// Ends the servers and the timers, when the agent is gone.
     pub(crate) fn close(&self) {
-        let mut state = self.0.state.lock();
-        let servers = std::mem::take(&mut state.servers);
-        let timers = state.timers.take();
-        for task in state.tasks.values() {
+        for task in self.0.state.lock().tasks.values() {
             task.stop.send_replace(Some(Cause::Withdrawn));
         }
-        drop(state);
-        drop(servers);
-        if let Some(timers) = timers {
-            timers.abort();
-        }
+        let serving = self.0.serving.lock().take();
+        drop(serving);
     }
 
     pub(crate) fn withdraw(&self, action: &str) {
@@ -559,5 +569,38 @@ impl Execution {
     #[must_use]
     pub fn stop_cause(&self) -> Option<Cause> {
         *self.stopped.borrow()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+    use std::sync::Barrier;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::thread;
+
+    use super::*;
+
+    #[test]
+    fn threads_that_offer_first_at_once_start_the_servers_once() {
+        const THREADS: usize = 4;
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let table = ActionTable::default();
+        let (starts, barrier) = (AtomicUsize::new(0), Barrier::new(THREADS));
+        thread::scope(|scope| {
+            for _ in 0..THREADS {
+                scope.spawn(|| {
+                    barrier.wait();
+                    let started = table.serve(runtime.handle(), || {
+                        starts.fetch_add(1, Ordering::Relaxed);
+                        thread::yield_now();
+                        Ok::<_, Infallible>(Vec::new())
+                    });
+                    started.unwrap();
+                });
+            }
+        });
+        assert_eq!(starts.into_inner(), 1);
+        table.close();
     }
 }

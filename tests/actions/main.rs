@@ -534,12 +534,12 @@ async fn a_handler_that_decides_accepts_or_rejects_goals() {
 /// The time for an answer is shorter than the decision. The robot reports that it has the goal.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_client_waits_for_a_late_decision() {
-    let (here, there) = two(&config(&["mts.deadline=1s"])).await;
+    let (here, there) = two(&config(&["mts.deadline=3s"])).await;
     let robot = here.register("crex").await.unwrap();
     let slow = Action::new("plan").decided_by_handler();
     let _offer = robot
         .offer(slow, |(): (), run: Execution| async move {
-            tokio::time::sleep(Duration::from_secs(3)).await;
+            tokio::time::sleep(Duration::from_secs(9)).await;
             run.accept();
             Ok::<_, String>(())
         })
@@ -547,6 +547,19 @@ async fn a_client_waits_for_a_late_decision() {
     let rover = there.register("rover").await.unwrap();
     let plan = rover.robot(crex()).invoke("plan", &()).await.unwrap();
     plan.result::<()>().await.unwrap();
+}
+
+/// The robot answers the goal and the question for its status at the same time, when the goal is over.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_decision_that_crosses_the_question_for_it_counts() {
+    let mut host = host();
+    host.push("mts.deadline=2s".to_owned());
+    let domain = Domain::open(&load(host.clone())).await.unwrap();
+    let _robot = process::start("robot", &host);
+    let rover = domain.register("rover").await.unwrap();
+    let robot = rover.robot(AgentId::new("robot").unwrap());
+    let think = robot.invoke("think", &()).await.unwrap();
+    think.result::<()>().await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -5,6 +5,7 @@
 
 use std::io::{BufRead as _, BufReader};
 use std::process::Stdio;
+use std::time::Duration;
 
 use fipa::actions::{Action, Execution, Orphans};
 use fipa::{AgentId, Domain};
@@ -49,6 +50,14 @@ pub(crate) fn run() {
         if role == "robot" {
             let offered = agent.offer(endless("drive"), |(): (), run| forever(run));
             let _offer = offered.unwrap();
+            let think = Action::new("think").decided_by_handler();
+            // Nothing else runs meanwhile on the only thread.
+            let offered = agent.offer(think, |(): (), run| async move {
+                std::thread::sleep(THOUGHT);
+                run.accept();
+                Ok::<_, String>(())
+            });
+            let _second = offered.unwrap();
             println!("ready");
             std::future::pending::<()>().await;
         }
@@ -61,6 +70,9 @@ pub(crate) fn run() {
         std::future::pending::<()>().await;
     });
 }
+
+/// Time for which the action `think` blocks the robot, more than twice the deadline of letters.
+pub(crate) const THOUGHT: Duration = Duration::from_secs(5);
 
 /// An action that runs until it is to stop.
 pub(crate) fn endless(name: &str) -> Action {

@@ -172,7 +172,7 @@ async fn each_kind_of_answer_yields_its_result_or_error() {
 async fn missing_and_invalid_answers_are_errors() {
     let (rover, arm) = pair(&[]).await;
     let lift = || to(&rover, Performative::Request, &arm, "lift");
-    let mut request = rover.request(lift(), Duration::from_secs(1)).await.unwrap();
+    let mut request = rover.request(lift(), Duration::from_secs(4)).await.unwrap();
     assert!(matches!(
         request.result().await,
         Err(DialogueError::TimedOut)
@@ -186,7 +186,7 @@ async fn missing_and_invalid_answers_are_errors() {
     assert_eq!(*late.performative(), Performative::Agree);
 
     // No right answer follows the invalid one.
-    let mut request = rover.request(lift(), Duration::from_secs(1)).await.unwrap();
+    let mut request = rover.request(lift(), Duration::from_secs(4)).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     let invalid = arm.reply(&first, Performative::Propose).build().unwrap();
     arm.send(invalid).await.unwrap();

@@ -328,7 +328,7 @@ async fn a_dutch_auction_continues_while_goods_are_left() {
         let mut sold = Vec::new();
         let mut price = 40;
         while sold.len() < 2 {
-            let moment = Duration::from_secs(1);
+            let moment = Duration::from_secs(2);
             let bids = auction.call(price.to_string(), moment).await.unwrap();
             if let Some(first) = bids.proposals.first() {
                 auction.accept(first, "").await.unwrap();
@@ -364,7 +364,7 @@ async fn an_auction_without_a_bid_has_no_winner() {
             .english_auction(opening, &ids(&arms))
             .await
             .unwrap();
-        let moment = Duration::from_millis(300);
+        let moment = Duration::from_secs(1);
         assert!(
             auction
                 .call("10", moment)
@@ -393,7 +393,7 @@ async fn a_bid_that_crosses_the_next_call_does_not_count() {
             .english_auction(opening, &ids(&arms))
             .await
             .unwrap();
-        let moment = Duration::from_millis(300);
+        let moment = Duration::from_secs(1);
         let bids = auction.call("10", moment).await.unwrap();
         assert_eq!(bids.silent, ["arm"]);
         first_over.send(()).unwrap();

@@ -40,9 +40,11 @@ fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
 /// Sets the options of a connected socket.
 pub(crate) fn prepare(stream: &TcpStream, limits: &NetLimits) -> io::Result<()> {
     stream.set_nodelay(true)?;
-    // Bounds the time without an acknowledgment of the peer's host, for example after a cable was
-    // unplugged.
-    SockRef::from(stream).set_tcp_user_timeout(Some(limits.keep_alive.saturating_mul(2)))
+    // Bounds the time for which the kernel keeps bytes that the peer's host does not acknowledge, also after the end of
+    // the connection. The kernel counts the time in which the peer does not read, too, and a peer may wait for memory.
+    let unread = limits.stall_timeout.saturating_mul(NetLimits::PERIODS);
+    let timeout = limits.keep_alive.saturating_mul(2).saturating_add(unread);
+    SockRef::from(stream).set_tcp_user_timeout(Some(timeout))
 }
 
 /// Opens a connection to an address. Returns the address, too.

@@ -8,6 +8,7 @@ mod common;
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::sync::{Arc, Barrier};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -28,8 +29,8 @@ const TCP_LETTER_JADE: &[u8] = include_bytes!("data/tcp_letter_jade.bin");
 
 fn impatient() -> Party {
     let mut config = config(&["127.0.0.1:0"]);
-    config.limits.handshake_timeout = Duration::from_millis(300);
-    config.limits.stall_timeout = Duration::from_millis(300);
+    config.limits.handshake_timeout = Duration::from_secs(1);
+    config.limits.stall_timeout = Duration::from_secs(1);
     Party::with(config)
 }
 
@@ -392,16 +393,24 @@ fn memory_for_announced_content_is_bounded_without_effect_on_others() {
     until_some("no place", || (party.lent().0 == 0).then_some(()));
 }
 
-/// A peer that sends a hello, announces a letter of `len` bytes, sends half of it, and then just
-/// enough to keep the connection. Returns whether the connection was closed.
-fn sends_half(party: &Party, incarnation: u64, len: usize, at_a_time: usize) -> JoinHandle<bool> {
+/// A peer that sends a hello. From this start on, it announces a letter of `len` bytes, sends half of it, and then
+/// just enough to keep the connection. Returns whether the connection was closed.
+fn sends_half(
+    party: &Party,
+    incarnation: u64,
+    len: usize,
+    at_a_time: usize,
+    start: &Arc<Barrier>,
+) -> JoinHandle<bool> {
     let mut stream = connect(party);
+    stream.write_all(&hello(incarnation)).unwrap();
+    let start = Arc::clone(start);
     std::thread::spawn(move || {
         let letter = frame(1, &parcel(1, vec![0; len]));
-        let mut begun = hello(incarnation);
-        begun.extend(&letter[..letter.len() / 2]);
-        let mut rest = letter[letter.len() / 2..].chunks(at_a_time);
-        let mut open = stream.write_all(&begun).is_ok();
+        let (begun, rest) = letter.split_at(letter.len() / 2);
+        let mut rest = rest.chunks(at_a_time);
+        start.wait();
+        let mut open = stream.write_all(begun).is_ok();
         while let Some(piece) = rest.next().filter(|_| open) {
             std::thread::sleep(Duration::from_millis(50));
             open = stream.write_all(piece).is_ok();
@@ -421,10 +430,12 @@ fn half_letters_stay_within_the_memory_budget_and_block_no_peer() {
     small.limits.stall_timeout = Duration::from_millis(150);
     // All of them together would have 32 MiB.
     let party = Party::lending(small);
+    let start = Arc::new(Barrier::new(33));
     let rogues: Vec<JoinHandle<bool>> = (1..=32)
-        .map(|n| sends_half(&party, n, EACH, 5000))
+        .map(|n| sends_half(&party, n, EACH, 5000, &start))
         .collect();
     counted(&party, |c| c.connections, 32);
+    start.wait();
     until_some("two letters", || (party.lent().0 == 2 * EACH).then_some(()));
     let honest = Party::new();
     for attempt in 1..=3 {
@@ -445,14 +456,14 @@ fn half_letters_stay_within_the_memory_budget_and_block_no_peer() {
 fn a_connection_that_is_not_read_for_lack_of_memory_stays_open() {
     let lively = || {
         let mut config = config(&["127.0.0.1:0"]);
-        config.limits.keep_alive = Duration::from_millis(200);
+        config.limits.keep_alive = Duration::from_millis(500);
         config
     };
     let mut small = lively();
     small.limits.max_incoming = 1 << 20;
-    small.limits.stall_timeout = Duration::from_millis(1500);
+    small.limits.stall_timeout = Duration::from_secs(4);
     let party = Party::lending(small);
-    let rogue = sends_half(&party, 77, 1 << 20, 500);
+    let rogue = sends_half(&party, 77, 1 << 20, 500, &Arc::new(Barrier::new(1)));
     until_some("its letter", || (party.lent().0 == 1 << 20).then_some(()));
     let honest = Party::with(lively());
     let sent = parcel(1, vec![1; 1 << 20]);

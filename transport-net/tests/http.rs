@@ -519,7 +519,7 @@ fn an_answer_other_than_200_is_a_failed_attempt() {
 #[test]
 fn a_letter_without_an_answer_is_unconfirmed_and_never_repeated() {
     let party = with(NetLimits {
-        stall_timeout: Duration::from_millis(300),
+        stall_timeout: Duration::from_secs(2),
         ..config(&[]).limits
     });
     // The first request is answered, the second is not, and the connection is closed.

@@ -221,13 +221,13 @@ fn an_idle_connection_closes_and_opens_again() {
 fn a_connection_kept_open_by_an_unanswered_letter_is_kept_alive() {
     let mut lively = config(&["127.0.0.1:0"]);
     lively.limits.idle_close = Duration::from_millis(20);
-    lively.limits.keep_alive = Duration::from_millis(200);
+    lively.limits.keep_alive = Duration::from_millis(500);
     let a = Party::with(lively);
     let b = Party::judging(config(&["127.0.0.1:0"]), Reaction::Later);
     a.send(1, b.location(), parcel(1, "x")).unwrap();
     until_some("the arrival", || (b.arrivals() == 1).then_some(()));
     // Several times the time after which a silent peer is given up.
-    std::thread::sleep(Duration::from_millis(1200));
+    std::thread::sleep(Duration::from_secs(3));
     let ticket = b.sink.record.lock().arrivals[0].2;
     b.transport.answer(ticket, Answer::Custody);
     assert_eq!(a.conclusion(1), Conclusion::Answered(Answer::Custody));

@@ -212,20 +212,25 @@ class Locks(Loops):
 
 class Actions(Loops):
     async def test_a_function_is_an_action(self) -> None:
+        seen = asyncio.Event()
+
         @self.arm.action
         async def move(goal: fipa.Goal, x: float, steps: int = 2) -> float:
             """Moves along x."""
             for step in range(steps):
                 goal.progress(step / steps, f"step {step}", {"x": x * step})
                 await asyncio.sleep(0.15)
+            await asyncio.wait_for(seen.wait(), 30)
             return x * steps
 
         (description,) = await self.rover.actions(self.arm.name)
         self.assertEqual((description["name"], description["description"]), ("move", "Moves along x."))
         self.assertEqual([it["type"] for it in description["parameters"]], ["number", "integer"])
         goal = self.rover.invoke(self.arm.name, "move", {"x": 1.5, "steps": 3})
-        notes = {progress["note"] async for progress in goal}
-        self.assertIn("step 2", notes)
+        async for progress in goal:
+            if progress["note"] == "step 2":
+                seen.set()
+        self.assertTrue(seen.is_set())
         self.assertEqual(await goal.result(), 4.5)
         with self.assertRaises(fipa.Refused):
             await self.rover.invoke(self.arm.name, "move", {"x": "far"}).result()

@@ -179,7 +179,7 @@ async fn acquire(agent: &Agent, arguments: &Arguments) -> Result<Lock, Failure> 
 }
 
 /// Maximum wait for the name of the holder after the time of --within.
-const HOLDER_TIMEOUT: Duration = Duration::from_millis(500);
+const HOLDER_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The holder of a resource, as its owner reports it.
 async fn holder(agent: &Agent, resource: &str) -> Option<String> {

@@ -142,8 +142,8 @@ fn a_clock_that_jumps_from_1970_to_now_loses_no_letter_and_ends_no_lock_or_regis
         "set it if it is wrong",
     ]);
 
-    // A grant ends after a second unless its holder renews it.
-    let own = ["own", "bay", "--forget", "--lease", "1s", "--volatile"];
+    // A grant ends after three seconds unless its holder renews it.
+    let own = ["own", "bay", "--forget", "--lease", "3s", "--volatile"];
     let _owner = rover.start(&own);
     let hold = ["lock", "bay", "--", "sh", "-c", "echo held; exec sleep 600"];
     let mut holder = rover.start(&hold);
@@ -162,7 +162,7 @@ fn a_clock_that_jumps_from_1970_to_now_loses_no_letter_and_ends_no_lock_or_regis
     let waiting = ["send", "stopped", "x", "--deadline", "60s"];
     let mut waiting = rover.command(&waiting);
     let waiting = thread::spawn(move || waiting.output().unwrap());
-    let (rate, count) = ("100", LETTERS.to_string());
+    let (rate, count) = ("40", LETTERS.to_string());
     let load = [
         "send",
         "near",

@@ -6,7 +6,7 @@ enum { OPERATION = 1 };
 
 /* A time limit in milliseconds that no step reaches, and one that passes. */
 #define LONG 60000
-#define SHORT 1000
+#define SHORT 3000
 
 static fipa_handle domain, agent;
 static const char *partner;

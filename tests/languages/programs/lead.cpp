@@ -10,7 +10,7 @@ using namespace std::chrono_literals;
 
 /* A time limit that no step reaches, and one that passes. */
 constexpr auto long_limit = 60s;
-constexpr auto short_limit = 1s;
+constexpr auto short_limit = 3s;
 
 enum tag : std::uint64_t { operations = 1 };
 

@@ -16,7 +16,7 @@ use serde::Serialize;
 /// A time limit that no step reaches.
 const LONG: Duration = Duration::from_secs(60);
 /// A time limit that passes.
-const SHORT: Duration = Duration::from_secs(1);
+const SHORT: Duration = Duration::from_secs(3);
 
 fn step(name: &str, observed: impl Display) {
     println!("{name}: {observed}");
