@@ -27,7 +27,11 @@ fn rover(host: &Host) -> ChildGuard {
         "--rate",
         "50",
     ];
-    ChildGuard::until_ready(&mut host.command(&rover)).0
+    let rover = ChildGuard::start(host.command(&rover).stdout(Stdio::null()));
+    until("the rover is registered", || {
+        host.run(&["agents"]).done().contains("rover")
+    });
+    rover
 }
 
 /// Sends one letter to an agent that does not exist.
