@@ -6,6 +6,7 @@ use std::net::SocketAddr;
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
 use tokio::net::{TcpListener, TcpStream};
 
+use crate::stream::budget::PERIODS;
 use crate::stream::config::NetLimits;
 
 /// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
@@ -42,7 +43,7 @@ pub(crate) fn prepare(stream: &TcpStream, limits: &NetLimits) -> io::Result<()> 
     stream.set_nodelay(true)?;
     // Bounds the time for which the kernel keeps bytes that the peer's host does not acknowledge, also after the end of
     // the connection. The kernel counts the time in which the peer does not read, too, and a peer may wait for memory.
-    let unread = limits.stall_timeout.saturating_mul(NetLimits::PERIODS);
+    let unread = limits.stall_timeout.saturating_mul(PERIODS);
     let timeout = limits.keep_alive.saturating_mul(2).saturating_add(unread);
     SockRef::from(stream).set_tcp_user_timeout(Some(timeout))
 }

@@ -22,8 +22,10 @@ use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::sync::futures::Notified;
 
-use super::config::NetLimits;
 use super::source::QuotaKey;
+
+/// Number of periods of `stall_timeout` within which a letter must arrive while others wait for its memory.
+pub(crate) const PERIODS: u32 = 12;
 
 /// Maximum number of bytes that are reserved at a time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -251,7 +253,7 @@ impl ReservedBytes {
     /// reservation while others wait, otherwise 0.
     pub(crate) fn least_progress(&self) -> u64 {
         match self.byte_budget.is_contended() {
-            true => self.len as u64 / u64::from(NetLimits::PERIODS),
+            true => self.len as u64 / u64::from(PERIODS),
             false => 0,
         }
     }
@@ -356,7 +358,7 @@ mod tests {
         assert!(meters[3].take(31).is_none(), "the whole budget is 200");
         assert!(meters[4].take(10).is_none(), "an earlier meter waits");
         assert_eq!(byte_budget.taken(), 170);
-        assert_eq!(first.least_progress(), 80 / u64::from(NetLimits::PERIODS));
+        assert_eq!(first.least_progress(), 80 / u64::from(PERIODS));
         drop(first);
         let third = meters[1].take(21).unwrap();
         let fourth = meters[3].take(31).unwrap();

@@ -223,9 +223,6 @@ impl NetLimits {
     /// Number of bytes that must arrive within `stall_timeout` while a frame has partly arrived.
     pub const MIN_PROGRESS: u64 = 4096;
 
-    /// Number of periods of `stall_timeout` within which a letter must arrive while others wait for its memory.
-    pub(crate) const PERIODS: u32 = 12;
-
     #[cfg(feature = "ip")]
     pub(crate) fn rates(&self) -> Rates {
         Rates {
