@@ -7,7 +7,7 @@ mod support;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fipa::admin::watch::{Event, Fate, Passage, WatchOptions, Watcher};
 use fipa::{
@@ -322,8 +322,10 @@ async fn the_outcome_of_the_only_letter_of_a_process_is_seen() {
     until_seen(&mut watcher, &own, "own").await;
     // Fills the queue of the arm.
     let moment = Duration::from_millis(200);
+    let began = Instant::now();
     let mut filling = true;
     while filling {
+        assert!(began.elapsed() < WATCHDOG, "the queue is not full");
         let one = own.send_within(request(&own, "arm", "one"), moment);
         let outcome = &one.await.unwrap().0[0].outcome;
         filling = !matches!(

@@ -331,9 +331,13 @@ impl GoalHandle<'_> {
             let status = self.robot.status_of(goal.clone()).await;
             match status {
                 Ok(status) if !status.state.is_over() => {}
-                // The answer to the goal is under way.
-                Ok(_) if !is_over => is_over = true,
-                _ => return Err(ActionError::Dialogue(DialogueError::TimedOut)),
+                // The answer to the goal, a refusal if the robot does not know it, is under way.
+                Ok(_) | Err(ActionError::Refused(_)) if !is_over => is_over = true,
+                // It may have arrived while the robot was asked.
+                _ => match tokio::time::timeout(Duration::ZERO, self.request.agreed()).await {
+                    Ok(agreed) => return Ok(agreed.map(drop)?),
+                    Err(_) => return Err(ActionError::Dialogue(DialogueError::TimedOut)),
+                },
             }
         }
     }
@@ -375,18 +379,34 @@ impl GoalHandle<'_> {
     pub async fn outcome(&mut self) -> Result<Option<Term<'static>>, ActionError> {
         let mut reachability = self.request.reachability();
         let message = loop {
-            if self.was_silent && reachability.unreachable().is_empty() {
-                let again = self.robot.send(self.goal.clone()).await?.request;
-                reachability = again.reachability();
-                self.earlier
-                    .push(std::mem::replace(&mut self.request, again));
-                self.was_silent = false;
+            let asks_again = self.was_silent && reachability.unreachable().is_empty();
+            if asks_again {
+                match self.robot.send(self.goal.clone()).await {
+                    Ok(again) => {
+                        reachability = again.reachability();
+                        self.earlier
+                            .push(std::mem::replace(&mut self.request, again.request));
+                        self.was_silent = false;
+                    }
+                    // The robot has the goal, and answers the requests that there are.
+                    Err(ActionError::Refused(Refusal::TooManyGoals)) => self.was_silent = false,
+                    // The host may be silent again.
+                    Err(ActionError::Dialogue(_)) => {}
+                    // The goal is over. Its result may have arrived while the robot was asked.
+                    Err(error) => {
+                        match tokio::time::timeout(Duration::ZERO, self.request.result()).await {
+                            Ok(message) => break message?,
+                            Err(_) => return Err(error),
+                        }
+                    }
+                }
             }
             self.was_silent |= !reachability.unreachable().is_empty();
             tokio::select! {
                 biased;
                 message = self.request.result() => break message?,
                 true = reachability.changed() => {}
+                () = tokio::time::sleep(self.robot.timeout()), if self.was_silent && asks_again => {}
             }
         };
         match read(self.robot.language, &self.ask, &message)? {

@@ -657,6 +657,8 @@ impl Task {
                 }
                 expired = self.timer.expired() => {
                     expired?;
+                    // After a pause of this process, messages wait that arrived before the time.
+                    self.handle_waiting();
                     self.shared.act(&self.core, |state, now, actions| {
                         state.armed = None;
                         state.core.handle_timeout(now, actions);

@@ -563,6 +563,27 @@ async fn a_decision_that_crosses_the_question_for_it_counts() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn an_answer_that_arrives_while_the_robot_is_asked_for_the_status_counts() {
+    let (here, there) = two(&config(&["mts.deadline=1s"])).await;
+    let (rover, robot) = (
+        here.register("rover").await.unwrap(),
+        there.register("crex").await.unwrap(),
+    );
+    let crex = rover.robot(crex());
+    let answering = async {
+        let goal = robot.receive().await.unwrap();
+        let question = robot.receive().await.unwrap();
+        assert_eq!(question.message().protocol(), Some("fipa-query"));
+        let agree = robot.reply(goal.message(), Performative::Agree);
+        let sent = robot.send(agree.build().unwrap()).await.unwrap();
+        assert!(sent.all_succeeded(), "{sent}");
+        // The question is not answered.
+    };
+    let (goal, ()) = tokio::join!(crex.invoke("jump", &()), answering);
+    goal.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_robot_that_is_killed_ends_the_handle() {
     let host = host();
     let domain = Domain::open(&load(host.clone())).await.unwrap();

@@ -13,6 +13,7 @@ mod support;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use fipa::actions::GoalState;
 use fipa::blocking::Wait;
 use fipa::protocol::{DialogueError, PartnerEvent};
 use fipa::{Agent, AgentId, Domain, Gateway, Message, MessageBuilder, Performative};
@@ -360,4 +361,31 @@ async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
     arm.finish();
     assert_eq!(text(&result.await.unwrap().unwrap()), "done");
     assert_eq!(text(&patient(charge.next()).await.unwrap()), "second");
+}
+
+/// A robot takes four requests for one goal.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_goal_goes_on_although_its_host_is_silent_again_and_again() {
+    let hosts = TwoHosts::start(&["monitor.heartbeat=1s"]).await;
+    let mut process = hosts.agent("robot").await;
+    let rover = Arc::new(hosts.domain.register("rover").await.unwrap());
+    let robot = rover.robot(AgentId::new("robot").unwrap());
+    let goal = robot.invoke("hold", &()).await.unwrap();
+    let mut reachability = goal.reachability();
+    let id = goal.id().to_owned();
+    let watched = async {
+        for _ in 0..5 {
+            hosts.far.signal(Signal::STOP);
+            assert!(patient(reachability.changed()).await);
+            assert!(!reachability.unreachable().is_empty());
+            hosts.far.signal(Signal::CONT);
+            assert!(patient(reachability.changed()).await);
+            assert!(reachability.unreachable().is_empty());
+            let status = robot.status_of(id.as_str()).await.unwrap();
+            assert_eq!(status.state, GoalState::Running);
+        }
+        process.finish();
+    };
+    let (result, ()) = tokio::join!(goal.result::<String>(), watched);
+    assert_eq!(result.unwrap(), "done");
 }

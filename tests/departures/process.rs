@@ -11,6 +11,7 @@ use std::sync::Arc;
 use std::sync::mpsc;
 use std::time::Duration;
 
+use fipa::actions::Action;
 use fipa::protocol::{DialogueError, Reply, Task};
 use fipa::{Agent, AgentId, Config, Domain, Gateway, Incoming, Kind, Performative};
 use tokio::sync::Semaphore;
@@ -62,8 +63,28 @@ pub(crate) fn run() {
             say("ready");
             std::future::pending::<()>().await;
         }
+        if name == "robot" {
+            robot(&config, &finish).await;
+        }
         agent(&config, &name, &finish).await;
     });
+}
+
+/// Offers an action that ends when the test says so.
+async fn robot(config: &Config, finish: &Arc<Semaphore>) {
+    let domain = Domain::open(config).await.unwrap();
+    let robot = domain.register("robot").await.unwrap();
+    let finish = Arc::clone(finish);
+    let hold = move |(): (), _| {
+        let finish = Arc::clone(&finish);
+        async move {
+            finish.acquire().await.unwrap().forget();
+            Ok::<_, String>("done".to_owned())
+        }
+    };
+    let _offer = robot.offer(Action::new("hold"), hold).unwrap();
+    say("ready");
+    std::future::pending::<()>().await;
 }
 
 async fn agent(config: &Config, name: &str, finish: &Arc<Semaphore>) {

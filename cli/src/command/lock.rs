@@ -205,6 +205,8 @@ async fn hold(lock: &Lock, arguments: &Arguments, signals: &mut Signals) -> Resu
     let mut is_lost = false;
     loop {
         tokio::select! {
+            // After a pause of this process, a command that has ended needs no lock.
+            biased;
             status = child.wait() => return ended(status),
             signal = signals.next() => to_group(group, signal),
             lost = lock.lost(), if !is_lost => {

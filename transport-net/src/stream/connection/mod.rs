@@ -162,7 +162,8 @@ struct Clock {
     written_since: u64,
     /// Time of the last parcel, answer or hello.
     busy: Instant,
-    pinged: bool,
+    /// When the peer got a ping, and the time that the bytes before it may take to reach the peer.
+    pinged: Option<(Instant, Duration)>,
     /// Time since which the connection is in doubt; see [`Connection::doubt`].
     doubted: Option<Instant>,
     /// For each [reader](Reader): start of the present measuring period of a partly arrived frame, and
@@ -205,7 +206,7 @@ impl Connection {
                 written: now,
                 written_since: 0,
                 busy: now,
-                pinged: false,
+                pinged: None,
                 doubted: None,
                 partial: [None; 2],
             },
@@ -439,7 +440,7 @@ impl Connection {
     /// are no progress of a frame that has partly arrived at the other one.
     pub(crate) fn received(&mut self, reader: Reader, bytes: usize, partial: bool, now: Instant) {
         self.clock.received = now;
-        self.clock.pinged = false;
+        self.clock.pinged = None;
         self.clock.doubted = None;
         self.clock.written_since = 0;
         self.suspect = false;
@@ -460,7 +461,7 @@ impl Connection {
     pub(crate) fn pause(&mut self, paused: bool, now: Instant) {
         if std::mem::replace(&mut self.paused, paused) != paused {
             self.clock.received = now;
-            self.clock.pinged = false;
+            self.clock.pinged = None;
             self.clock.doubted = None;
             self.suspect = false;
         }
@@ -475,7 +476,7 @@ impl Connection {
         }
         if self.clock.doubted.is_none() {
             self.clock.doubted = Some(now);
-            if !self.clock.pinged {
+            if self.clock.pinged.is_none() {
                 self.push_control(frame::ping());
             }
         }
@@ -705,10 +706,10 @@ impl Connection {
                 }
                 return Ok(());
             }
-            if self.clock.pinged {
+            if self.clock.pinged.is_some() {
                 return Err(ConnectionEnd::Silent);
             }
-            self.clock.pinged = true;
+            self.clock.pinged = Some((now, self.transfer_time()));
             self.push_control(frame::ping());
         }
         Ok(())
@@ -769,18 +770,21 @@ impl Connection {
         self.attempts.is_empty() && self.arrivals.is_empty() && self.answers_waiting == 0
     }
 
-    /// Returns the time at which a ping is due or, after a ping, the peer is given up. Bytes that
-    /// the kernel still takes show that the peer reads: it may be busy with a large letter.
+    /// Returns the time at which a ping is due or, after a ping, the peer is given up. While bytes wait to be written,
+    /// bytes that the kernel still takes show that the peer reads: it may be busy with a large letter.
     fn sign_of_life_due(&self) -> Instant {
+        let keep_alive = self.limits.keep_alive;
         if self.paused {
             // Earlier than the peer's own ping.
-            return self.clock.received + self.limits.keep_alive / 2;
+            return self.clock.received + keep_alive / 2;
         }
-        if self.clock.pinged {
-            let last = self.clock.received.max(self.clock.written);
-            return last.max(self.clock.received + self.limits.keep_alive) + self.limits.keep_alive;
+        match self.clock.pinged {
+            None => self.clock.received + keep_alive,
+            Some((pinged, transfer_time)) if self.is_flushed() => {
+                pinged + transfer_time + keep_alive
+            }
+            Some((pinged, _)) => pinged.max(self.clock.written) + keep_alive,
         }
-        self.clock.received + self.limits.keep_alive
     }
 
     fn say_hello(&mut self) {

@@ -456,6 +456,22 @@ fn a_silent_peer_gets_a_ping_and_is_then_given_up() {
 }
 
 #[test]
+fn a_silent_peer_is_given_up_although_letters_are_written_to_it() {
+    let mut now = Instant::now();
+    let (mut a, _b) = greeted(now);
+    let keep_alive = limits().keep_alive;
+    let mut ended = Ok(());
+    // The kernel of this host takes each of them at once.
+    for _ in 0..6 {
+        now += keep_alive / 2;
+        a.post(100).unwrap();
+        a.transmit(usize::MAX, &mut BytesMut::new(), now);
+        ended = ended.and_then(|()| a.connection.handle_timeout(now, [0; 2]));
+    }
+    assert_eq!(ended, Err(ConnectionEnd::Silent));
+}
+
+#[test]
 fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
