@@ -235,21 +235,51 @@ impl<'a> Robot<'a> {
     /// If the goal has no notation, or cannot be sent.
     pub async fn propose(&self, mut goal: Goal) -> Result<GoalHandle<'a>, ActionError> {
         goal.id.get_or_insert_with(|| self.agent.unique_id());
+        Ok(GoalHandle {
+            robot: self.clone(),
+            request: self.request(&goal).await?,
+            ask: Ask::Goal(goal.clone()),
+            goal,
+            was_silent: false,
+            again: None,
+            earlier: Vec::new(),
+        })
+    }
+
+    async fn request(&self, goal: &Goal) -> Result<Request, ActionError> {
         let ask = Ask::Goal(goal.clone());
         let message = self.message(Performative::Request, &ask)?;
         let deadline = goal.deadline.map(Duration::from_millis);
         let timeout = deadline.and_then(|it| it.checked_add(GRACE + self.timeout()));
-        let request = self
-            .agent
-            .request(message, timeout.unwrap_or(Duration::MAX));
-        Ok(GoalHandle {
-            robot: self.clone(),
-            goal,
-            ask,
-            request: request.await?,
-            was_silent: false,
-            earlier: Vec::new(),
-        })
+        let timeout = timeout.unwrap_or(Duration::MAX);
+        Ok(self.agent.request(message, timeout).await?)
+    }
+
+    /// Waits until the robot accepts a goal.
+    async fn accepted(&self, goal: &Goal, request: &mut Request) -> Result<(), ActionError> {
+        let goal = GoalRef::from(goal.id.as_deref().unwrap_or_default());
+        let mut is_over = false;
+        loop {
+            let timeout = match is_over {
+                // The deadline of a letter.
+                true => self.timeout() / 2,
+                false => self.timeout(),
+            };
+            if let Ok(agreed) = tokio::time::timeout(timeout, request.agreed()).await {
+                agreed?;
+                return Ok(());
+            }
+            match self.status_of(goal.clone()).await {
+                Ok(status) if !status.state.is_over() => {}
+                // The answer to the goal, a refusal if the robot does not know it, is under way.
+                Ok(_) | Err(ActionError::Refused(_)) if !is_over => is_over = true,
+                // It may have arrived while the robot was asked.
+                _ => match tokio::time::timeout(Duration::ZERO, request.agreed()).await {
+                    Ok(agreed) => return Ok(agreed.map(drop)?),
+                    Err(_) => return Err(ActionError::Dialogue(DialogueError::TimedOut)),
+                },
+            }
+        }
     }
 
     fn timeout(&self) -> Duration {
@@ -291,8 +321,23 @@ pub struct GoalHandle<'a> {
     request: Request,
     /// Whether the host of the robot was silent since the robot was asked last.
     was_silent: bool,
+    /// A request that the robot has not accepted yet.
+    again: Option<Request>,
     /// Those before the host of the robot was silent. Their late answers are not for the application.
     earlier: Vec<Request>,
+}
+
+/// Sends a goal again, unless that was done, and waits until the robot accepts it.
+async fn ask_again(
+    robot: &Robot<'_>,
+    goal: &Goal,
+    again: &mut Option<Request>,
+) -> Result<(), ActionError> {
+    let request = match again {
+        Some(request) => request,
+        None => again.insert(robot.request(goal).await?),
+    };
+    robot.accepted(goal, request).await
 }
 
 impl GoalHandle<'_> {
@@ -320,26 +365,7 @@ impl GoalHandle<'_> {
     /// If the robot refuses ([`ActionError::Refused`]), is gone, or neither answers in time nor reports that it has the
     /// goal.
     pub async fn accepted(&mut self) -> Result<(), ActionError> {
-        let goal = GoalRef::from(self.id());
-        let mut is_over = false;
-        loop {
-            let agreed = self.request.agreed();
-            if let Ok(agreed) = tokio::time::timeout(self.robot.timeout(), agreed).await {
-                agreed?;
-                return Ok(());
-            }
-            let status = self.robot.status_of(goal.clone()).await;
-            match status {
-                Ok(status) if !status.state.is_over() => {}
-                // The answer to the goal, a refusal if the robot does not know it, is under way.
-                Ok(_) | Err(ActionError::Refused(_)) if !is_over => is_over = true,
-                // It may have arrived while the robot was asked.
-                _ => match tokio::time::timeout(Duration::ZERO, self.request.agreed()).await {
-                    Ok(agreed) => return Ok(agreed.map(drop)?),
-                    Err(_) => return Err(ActionError::Dialogue(DialogueError::TimedOut)),
-                },
-            }
-        }
+        self.robot.accepted(&self.goal, &mut self.request).await
     }
 
     /// Subscribes to the progress of the goal. The handle can be used meanwhile.
@@ -379,34 +405,45 @@ impl GoalHandle<'_> {
     pub async fn outcome(&mut self) -> Result<Option<Term<'static>>, ActionError> {
         let mut reachability = self.request.reachability();
         let message = loop {
-            let asks_again = self.was_silent && reachability.unreachable().is_empty();
+            let is_silent = !reachability.unreachable().is_empty();
+            self.was_silent |= is_silent;
+            let asks_again = self.was_silent && !is_silent;
             if asks_again {
-                match self.robot.send(self.goal.clone()).await {
-                    Ok(again) => {
-                        reachability = again.reachability();
-                        self.earlier
-                            .push(std::mem::replace(&mut self.request, again.request));
+                let again = tokio::select! {
+                    biased;
+                    message = self.request.result() => break message?,
+                    again = ask_again(&self.robot, &self.goal, &mut self.again) => again,
+                };
+                if again.is_err() {
+                    self.again = None;
+                }
+                match again {
+                    Ok(()) => {
+                        if let Some(mut again) = self.again.take() {
+                            again.take_reachability(&mut self.request);
+                            let earlier = std::mem::replace(&mut self.request, again);
+                            self.earlier.push(earlier);
+                        }
                         self.was_silent = false;
+                        continue;
                     }
                     // The robot has the goal, and answers the requests that there are.
                     Err(ActionError::Refused(Refusal::TooManyGoals)) => self.was_silent = false,
-                    // The host may be silent again.
-                    Err(ActionError::Dialogue(_)) => {}
-                    // The goal is over. Its result may have arrived while the robot was asked.
-                    Err(error) => {
-                        match tokio::time::timeout(Duration::ZERO, self.request.result()).await {
-                            Ok(message) => break message?,
-                            Err(_) => return Err(error),
-                        }
-                    }
+                    Err(ActionError::Dialogue(
+                        DialogueError::NotDelivered { .. }
+                        | DialogueError::Undelivered(_)
+                        | DialogueError::Unreachable { .. },
+                    )) => {}
+                    // The host is silent again.
+                    Err(_) if !reachability.unreachable().is_empty() => {}
+                    Err(error) => return Err(error),
                 }
             }
-            self.was_silent |= !reachability.unreachable().is_empty();
             tokio::select! {
                 biased;
                 message = self.request.result() => break message?,
                 true = reachability.changed() => {}
-                () = tokio::time::sleep(self.robot.timeout()), if self.was_silent && asks_again => {}
+                () = tokio::time::sleep(self.robot.timeout()), if asks_again && self.was_silent => {}
             }
         };
         match read(self.robot.language, &self.ask, &message)? {

@@ -368,7 +368,7 @@ impl Dialogue {
     /// Takes over the receivers of the reachability of another conversation.
     pub(super) fn take_reachability(&mut self, other: &mut Self) {
         std::mem::swap(&mut self.reachability, &mut other.reachability);
-        self.reachability.set(std::iter::empty());
+        self.reachability.set(self.partners.unreachable());
     }
 
     /// Ends the conversation, except for one last message.

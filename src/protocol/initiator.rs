@@ -197,6 +197,12 @@ impl Request {
         self.dialogue.reachability()
     }
 
+    /// Takes over the receivers of the reachability of another conversation with the other agent.
+    #[cfg(feature = "actions")]
+    pub(crate) fn take_reachability(&mut self, other: &mut Self) {
+        self.dialogue.take_reachability(&mut other.dialogue);
+    }
+
     /// Waits for the first answer, and returns whether it is an `agree`. If it is the result itself,
     /// [`result`](Self::result) returns it.
     ///

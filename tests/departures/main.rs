@@ -382,7 +382,7 @@ async fn a_goal_goes_on_although_its_host_is_silent_again_and_again() {
             assert!(patient(reachability.changed()).await);
             assert!(reachability.unreachable().is_empty());
             let status = robot.status_of(id.as_str()).await.unwrap();
-            assert_eq!(status.state, GoalState::Running);
+            assert_eq!(status.state, GoalState::Executing);
         }
         process.finish();
     };

@@ -126,6 +126,12 @@ fn a_grant_that_arrives_during_a_pause_is_not_too_late() {
         let rover = agent(&here, "rover").await;
         (here, Arc::new(rover))
     });
+    // Finds the owner.
+    let first = near.block_on(rover.lock("bay")).unwrap();
+    first.release();
+    near.block_on(until_async("the bay is free", || {
+        bay.status().holder.is_none()
+    }));
     let within = Duration::from_secs(2);
     // Whether the message or the timer is handled first is decided by chance.
     for _ in 0..5 {

@@ -162,13 +162,21 @@ struct Clock {
     written_since: u64,
     /// Time of the last parcel, answer or hello.
     busy: Instant,
-    /// When the peer got a ping, and the time that the bytes before it may take to reach the peer.
-    pinged: Option<(Instant, Duration)>,
+    pinged: Option<Ping>,
     /// Time since which the connection is in doubt; see [`Connection::doubt`].
     doubted: Option<Instant>,
     /// For each [reader](Reader): start of the present measuring period of a partly arrived frame, and
     /// the bytes that arrived since.
     partial: [Option<(Instant, u64)>; 2],
+}
+
+/// A ping without a byte of the peer after it.
+#[derive(Debug, Clone, Copy)]
+struct Ping {
+    /// When the ping was queued or, later, handed to the kernel.
+    at: Instant,
+    /// Number of control frames that wait to be written, up to the ping.
+    waiting: usize,
 }
 
 impl Connection {
@@ -614,7 +622,13 @@ impl Connection {
             Progress::Begun(About::Answer | About::Control) => {}
             Progress::Written(About::Parcel(_)) => *parcels_written += 1,
             Progress::Written(About::Answer) => *answers_waiting -= 1,
-            Progress::Written(About::Control) => *control_waiting -= 1,
+            Progress::Written(About::Control) => {
+                *control_waiting -= 1;
+                if let Some(ping) = clock.pinged.as_mut().filter(|ping| ping.waiting > 0) {
+                    ping.waiting -= 1;
+                    ping.at = now;
+                }
+            }
         });
     }
 
@@ -709,8 +723,11 @@ impl Connection {
             if self.clock.pinged.is_some() {
                 return Err(ConnectionEnd::Silent);
             }
-            self.clock.pinged = Some((now, self.transfer_time()));
             self.push_control(frame::ping());
+            self.clock.pinged = Some(Ping {
+                at: now,
+                waiting: self.control_waiting,
+            });
         }
         Ok(())
     }
@@ -780,10 +797,8 @@ impl Connection {
         }
         match self.clock.pinged {
             None => self.clock.received + keep_alive,
-            Some((pinged, transfer_time)) if self.is_flushed() => {
-                pinged + transfer_time + keep_alive
-            }
-            Some((pinged, _)) => pinged.max(self.clock.written) + keep_alive,
+            Some(ping) if ping.waiting == 0 && self.is_flushed() => ping.at + keep_alive,
+            Some(ping) => ping.at.max(self.clock.written) + keep_alive,
         }
     }
 

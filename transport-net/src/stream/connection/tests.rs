@@ -472,6 +472,27 @@ fn a_silent_peer_is_given_up_although_letters_are_written_to_it() {
 }
 
 #[test]
+fn a_ping_behind_a_large_letter_has_the_usual_time() {
+    let mut now = Instant::now();
+    let (mut a, _b) = greeted(now);
+    let keep_alive = limits().keep_alive;
+    a.post(4000).unwrap();
+    for _ in 0..10 {
+        now += keep_alive / 2;
+        a.transmit(100, &mut BytesMut::new(), now);
+        a.connection.handle_timeout(now, [0; 2]).unwrap();
+    }
+    a.transmit(usize::MAX, &mut BytesMut::new(), now);
+    assert!(a.connection.is_flushed());
+    a.connection.handle_timeout(now, [0; 2]).unwrap();
+    now += keep_alive;
+    assert_eq!(
+        a.connection.handle_timeout(now, [0; 2]),
+        Err(ConnectionEnd::Silent)
+    );
+}
+
+#[test]
 fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     let start = Instant::now();
     let (mut a, mut b) = greeted(start);
