@@ -86,7 +86,7 @@ async fn requests_that_wait_survive_a_restart_of_the_owner_in_their_order() {
         drop(bay);
         here.close().await;
         drop(crane);
-        let again = fipa::Domain::open(&config).await.unwrap();
+        let again = Domain::open(&config).await.unwrap();
         let crane = agent(&again, "crane").await;
         let bay = crane.own("bay", kept(&files, lease)).await.unwrap();
         assert!(!bay.admit(&fence));
