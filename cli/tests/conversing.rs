@@ -638,6 +638,7 @@ fn commands_that_continue_have_limits() {
         &["watch"],
         &["agents", "--watch"],
         &["locks", "--watch"],
+        &["topics", "--watch"],
         &["ping", "arm_1", "--interval", "1ms"],
         &["send", "--to", "arm_1", "--rate", "1000"],
     ] {

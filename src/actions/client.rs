@@ -13,7 +13,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::agent::Agent;
-use crate::protocol::{DialogueError, Reachability, Request, Subscription};
+use crate::protocol::{DialogueError, Notification, Reachability, Request, Subscription};
 
 /// Time that a robot has beyond the deadline of a goal to stop and to report.
 const GRACE: Duration = Duration::from_secs(10);
@@ -270,7 +270,7 @@ impl<'a> Robot<'a> {
                 return Ok(());
             }
             match self.status_of(goal.clone()).await {
-                Ok(status) if !status.state.is_over() => {}
+                Ok(status) if !status.state.is_over() => is_over = false,
                 // The answer to the goal, a refusal if the robot does not know it, is under way.
                 Ok(_) | Err(ActionError::Refused(_)) if !is_over => is_over = true,
                 // It may have arrived while the robot was asked.
@@ -280,6 +280,15 @@ impl<'a> Robot<'a> {
                 },
             }
         }
+    }
+
+    /// Sends a goal again, unless that was done, and waits until the robot accepts it.
+    async fn ask_again(&self, goal: &Goal, again: &mut Option<Request>) -> Result<(), ActionError> {
+        let request = match again {
+            Some(request) => request,
+            None => again.insert(self.request(goal).await?),
+        };
+        self.accepted(goal, request).await
     }
 
     fn timeout(&self) -> Duration {
@@ -325,19 +334,6 @@ pub struct GoalHandle<'a> {
     again: Option<Request>,
     /// Those before the host of the robot was silent. Their late answers are not for the application.
     earlier: Vec<Request>,
-}
-
-/// Sends a goal again, unless that was done, and waits until the robot accepts it.
-async fn ask_again(
-    robot: &Robot<'_>,
-    goal: &Goal,
-    again: &mut Option<Request>,
-) -> Result<(), ActionError> {
-    let request = match again {
-        Some(request) => request,
-        None => again.insert(robot.request(goal).await?),
-    };
-    robot.accepted(goal, request).await
 }
 
 impl GoalHandle<'_> {
@@ -411,10 +407,10 @@ impl GoalHandle<'_> {
             if asks_again {
                 let again = tokio::select! {
                     biased;
-                    message = self.request.result() => break message?,
-                    again = ask_again(&self.robot, &self.goal, &mut self.again) => again,
+                    message = self.request.result() => break message,
+                    again = self.robot.ask_again(&self.goal, &mut self.again) => again,
                 };
-                if again.is_err() {
+                if matches!(again, Err(ActionError::Refused(_))) {
                     self.again = None;
                 }
                 match again {
@@ -431,6 +427,7 @@ impl GoalHandle<'_> {
                     Err(ActionError::Refused(Refusal::TooManyGoals)) => self.was_silent = false,
                     Err(ActionError::Dialogue(
                         DialogueError::NotDelivered { .. }
+                        | DialogueError::TimedOut
                         | DialogueError::Undelivered(_)
                         | DialogueError::Unreachable { .. },
                     )) => {}
@@ -441,15 +438,32 @@ impl GoalHandle<'_> {
             }
             tokio::select! {
                 biased;
-                message = self.request.result() => break message?,
+                message = self.request.result() => break message,
                 true = reachability.changed() => {}
                 () = tokio::time::sleep(self.robot.timeout()), if asks_again && self.was_silent => {}
             }
         };
-        match read(self.robot.language, &self.ask, &message)? {
+        self.take_late_answers();
+        match read(self.robot.language, &self.ask, &message?)? {
             ActionAnswer::Done(value) => Ok(value),
             _ => Err(LanguageError::Form("a result").into()),
         }
+    }
+
+    /// Takes the answers to the earlier requests of a goal that is over.
+    fn take_late_answers(&mut self) {
+        let earlier = std::mem::take(&mut self.earlier).into_iter();
+        let requests: Vec<Request> = earlier.chain(self.again.take()).collect();
+        if requests.is_empty() {
+            return;
+        }
+        let timeout = self.robot.timeout();
+        let runtime = &self.robot.agent.domain().inner.service.runtime;
+        runtime.spawn(async move {
+            for mut request in requests {
+                let _late = tokio::time::timeout(timeout, request.result()).await;
+            }
+        });
     }
 
     /// Cancels the goal, waits until the robot has stopped, and returns true. Returns false if the goal
@@ -494,7 +508,7 @@ impl ProgressUpdates {
             return Ok(None);
         };
         if !self.is_over {
-            let message = subscription.next().await?;
+            let message = next_of(subscription).await?;
             let ActionAnswer::Status(mut all) = read(self.language, &self.ask, &message)? else {
                 return Err(LanguageError::Form("a status").into());
             };
@@ -508,6 +522,16 @@ impl ProgressUpdates {
         let _ = tokio::time::timeout(self.timeout, subscription.next()).await;
         self.subscription = None;
         Ok(None)
+    }
+}
+
+/// Waits for the next notification, also while the host of the robot is silent.
+async fn next_of(subscription: &mut Subscription) -> Result<Notification, DialogueError> {
+    loop {
+        match subscription.next().await {
+            Err(DialogueError::Unreachable { .. }) => {}
+            next => return next,
+        }
     }
 }
 
@@ -527,7 +551,7 @@ impl StatusUpdates {
     /// # Errors
     /// If the robot is gone or ends the subscription.
     pub async fn next(&mut self) -> Result<Vec<GoalStatus>, ActionError> {
-        let message = self.subscription.next().await?;
+        let message = next_of(&mut self.subscription).await?;
         match read(self.language, &self.ask, &message)? {
             ActionAnswer::Status(all) => Ok(all),
             _ => Err(ActionError::Answer(LanguageError::Form("a list of goals"))),

@@ -3,6 +3,7 @@
 use std::any::Any;
 use std::convert::Infallible;
 use std::sync::Arc;
+use std::time::Duration;
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_actions::{
@@ -15,7 +16,10 @@ use crate::agent::AgentCore;
 use crate::protocol::{DialogueError, Reply, Task, serve_those};
 
 /// Minimum time between two notifications of a subscription to all goals.
-const STATUS_INTERVAL: std::time::Duration = std::time::Duration::from_millis(100);
+const STATUS_INTERVAL: Duration = Duration::from_millis(100);
+
+/// Pause after a notification that was not delivered.
+const UNDELIVERED_PAUSE: Duration = Duration::from_secs(1);
 
 /// Starts the servers of an agent, unless they run.
 pub(super) fn start(core: &Arc<AgentCore>) -> Result<(), DialogueError> {
@@ -156,7 +160,8 @@ impl Side {
                     // The answer to the cancel comes first.
                     Some(Told::Agreed { queued }) if cancelled => late_agree = Some(queued),
                     Some(Told::Agreed { queued }) => {
-                        if task.agree(agreed(queued)).await.is_err() {
+                        let sent = task.agree(agreed(queued)).await;
+                        if sent.is_err_and(|error| !is_undelivered(&error)) {
                             return Reply::Nothing;
                         }
                     }
@@ -191,10 +196,11 @@ impl Side {
                 {
                     return Reply::Nothing;
                 }
-                if let Some(queued) = late_agree
-                    && task.agree(agreed(queued)).await.is_err()
-                {
-                    return Reply::Nothing;
+                if let Some(queued) = late_agree {
+                    let sent = task.agree(agreed(queued)).await;
+                    if sent.is_err_and(|error| !is_undelivered(&error)) {
+                        return Reply::Nothing;
+                    }
                 }
                 match self.language.unwrap_or(&fipa_actions::Sl).write_answer(
                     &self.robot,
@@ -277,8 +283,13 @@ impl Side {
                         let now = status.borrow_and_update().clone();
                         let is_over = now.state.is_over();
                         let content = self.write(&ask, &ActionAnswer::Status(vec![now]));
-                        if task.inform(content).await.is_err() {
-                            return Reply::Nothing;
+                        match task.inform(content).await {
+                            Ok(()) => {}
+                            Err(error) if is_undelivered(&error) => tokio::select! {
+                                ended = ended(&mut task) => return ended,
+                                () = tokio::time::sleep(UNDELIVERED_PAUSE) => continue,
+                            },
+                            Err(_) => return Reply::Nothing,
                         }
                         if is_over {
                             let end =
@@ -302,8 +313,13 @@ impl Side {
                 loop {
                     changes.mark_unchanged();
                     let content = self.write(&ask, &ActionAnswer::Status(self.table.status()));
-                    if task.inform(content).await.is_err() {
-                        return Reply::Nothing;
+                    match task.inform(content).await {
+                        Ok(()) => {}
+                        Err(error) if is_undelivered(&error) => tokio::select! {
+                            ended = ended(&mut task) => return ended,
+                            () = tokio::time::sleep(UNDELIVERED_PAUSE) => continue,
+                        },
+                        Err(_) => return Reply::Nothing,
                     }
                     let next = async {
                         tokio::time::sleep(STATUS_INTERVAL).await;
@@ -320,6 +336,11 @@ impl Side {
             _ => self.refuse_unread(Refusal::Malformed("a subscription to the status".into())),
         }
     }
+}
+
+/// Whether a message has not reached the client, whose host may be silent for a while.
+fn is_undelivered(error: &DialogueError) -> bool {
+    matches!(error, DialogueError::NotDelivered { .. })
 }
 
 /// Whether an error while a client is awaited is a mistake of the client, which does not end the conversation.

@@ -203,7 +203,7 @@ impl ActionTable {
         Ok(())
     }
 
-    /// Starts the servers of the agent, which this function returns, and the timers, unless they run.
+    /// Starts the servers, which `start` returns, and the timers, unless they run.
     pub(crate) fn serve<E>(
         &self,
         runtime: &Handle,

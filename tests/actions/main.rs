@@ -539,7 +539,7 @@ async fn a_client_waits_for_a_late_decision() {
     let slow = Action::new("plan").decided_by_handler();
     let _offer = robot
         .offer(slow, |(): (), run: Execution| async move {
-            tokio::time::sleep(Duration::from_secs(9)).await;
+            tokio::time::sleep(Duration::from_secs(7)).await;
             run.accept();
             Ok::<_, String>(())
         })

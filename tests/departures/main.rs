@@ -371,6 +371,14 @@ async fn a_goal_goes_on_although_its_host_is_silent_again_and_again() {
     let rover = Arc::new(hosts.domain.register("rover").await.unwrap());
     let robot = rover.robot(AgentId::new("robot").unwrap());
     let goal = robot.invoke("hold", &()).await.unwrap();
+    let mut progress = goal.progress().await.unwrap();
+    let all_progress = async {
+        let mut last = None;
+        while let Some(status) = patient(progress.next()).await.unwrap() {
+            last = Some(status.state);
+        }
+        last
+    };
     let mut reachability = goal.reachability();
     let id = goal.id().to_owned();
     let watched = async {
@@ -386,6 +394,9 @@ async fn a_goal_goes_on_although_its_host_is_silent_again_and_again() {
         }
         process.finish();
     };
-    let (result, ()) = tokio::join!(goal.result::<String>(), watched);
+    let (result, (), last) = tokio::join!(goal.result::<String>(), watched, all_progress);
     assert_eq!(result.unwrap(), "done");
+    assert_eq!(last, Some(GoalState::Done));
+    let unread = rover.try_receive().unwrap();
+    assert!(unread.is_none(), "{unread:?}");
 }

@@ -132,7 +132,7 @@ fn a_grant_that_arrives_during_a_pause_is_not_too_late() {
     near.block_on(until_async("the bay is free", || {
         bay.status().holder.is_none()
     }));
-    let within = Duration::from_secs(2);
+    let within = Duration::from_secs(1);
     // Whether the message or the timer is handled first is decided by chance.
     for _ in 0..5 {
         let held = far.block_on(arm.lock("bay")).unwrap();

@@ -1,6 +1,7 @@
 //! Goals of actions that a program pursues from outside Rust's futures.
 
 use std::fmt;
+use std::pin::pin;
 use std::sync::Arc;
 
 use fipa::actions::{
@@ -283,21 +284,28 @@ pub fn invoke(
         // A goal that has ended already has no progress.
         let mut updates = running.progress().await.ok();
         let result = loop {
-            tokio::select! {
-                biased;
-                status = async { updates.as_mut()?.next().await.ok().flatten() }, if updates.is_some() => {
-                    match status {
-                        Some(status) => {
-                            emitter.emit(GoalEvent::Progress(progress(&status)?)).await;
+            let result = {
+                let mut outcome = pin!(running.outcome());
+                loop {
+                    tokio::select! {
+                        biased;
+                        status = async { updates.as_mut()?.next().await.ok().flatten() }, if updates.is_some() => {
+                            match status {
+                                Some(status) => {
+                                    emitter.emit(GoalEvent::Progress(progress(&status)?)).await;
+                                }
+                                None => updates = None,
+                            }
                         }
-                        None => updates = None,
+                        result = &mut outcome => break Some(result),
+                        () = cancel.notified() => break None,
                     }
                 }
-                result = running.outcome() => break result.or_fail()?,
-                () = cancel.notified() => {
-                    running.cancel(CANCEL).await.or_fail()?;
-                }
+            };
+            if let Some(result) = result {
+                break result.or_fail()?;
             }
+            running.cancel(CANCEL).await.or_fail()?;
         };
         let value = match result {
             Some(term) => json_of(&term)?,

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::io::IsTerminal;
+use std::pin::pin;
 use std::time::Duration;
 
 use clap::Args;
@@ -163,21 +164,28 @@ async fn follow(
     // A goal that has ended and is not stored any more has no progress.
     let mut updates = handle.progress().await.ok();
     let outcome = loop {
-        tokio::select! {
-            biased;
-            status = next(&mut updates), if updates.is_some() => match status {
-                Some(status) => shown.show(&status)?,
-                None => updates = None,
-            },
-            outcome = handle.outcome() => break outcome,
-            () = stop.requested() => {
-                Stop::ending();
-                let stopped = handle.cancel(STOP).await.map_err(|error| report(&error))?;
-                if stopped {
-                    shown.end();
-                    return Err(cancelled(arguments, "while it ran"));
+        let outcome = {
+            let mut outcome = pin!(handle.outcome());
+            loop {
+                tokio::select! {
+                    biased;
+                    status = next(&mut updates), if updates.is_some() => match status {
+                        Some(status) => shown.show(&status)?,
+                        None => updates = None,
+                    },
+                    outcome = &mut outcome => break Some(outcome),
+                    () = stop.requested() => break None,
                 }
             }
+        };
+        if let Some(outcome) = outcome {
+            break outcome;
+        }
+        Stop::ending();
+        let stopped = handle.cancel(STOP).await.map_err(|error| report(&error))?;
+        if stopped {
+            shown.end();
+            return Err(cancelled(arguments, "while it ran"));
         }
     };
     shown.end();

@@ -205,9 +205,15 @@ async fn hold(lock: &Lock, arguments: &Arguments, signals: &mut Signals) -> Resu
     let mut is_lost = false;
     loop {
         tokio::select! {
-            // After a pause of this process, a command that has ended needs no lock.
+            // After a pause of this process, the command may have ended before its lock.
             biased;
-            status = child.wait() => return ended(status),
+            status = child.wait() => {
+                if !is_lost && !lock.is_held() {
+                    let resource = &arguments.resource;
+                    report::warn(&format!("the command has ended, and the lock of {resource:?} is lost"));
+                }
+                return ended(status);
+            }
             signal = signals.next() => to_group(group, signal),
             lost = lock.lost(), if !is_lost => {
                 is_lost = true;

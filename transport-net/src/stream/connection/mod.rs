@@ -173,7 +173,7 @@ struct Clock {
 /// A ping without a byte of the peer after it.
 #[derive(Debug, Clone, Copy)]
 struct Ping {
-    /// When the ping was queued or, later, handed to the kernel.
+    /// Time at which the ping was queued or, later, handed to the kernel.
     at: Instant,
     /// Number of control frames that wait to be written, up to the ping.
     waiting: usize,
