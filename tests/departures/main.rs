@@ -400,3 +400,36 @@ async fn a_goal_goes_on_although_its_host_is_silent_again_and_again() {
     let unread = rover.try_receive().unwrap();
     assert!(unread.is_none(), "{unread:?}");
 }
+
+/// Letters of the robot fail at their deadline, which is shorter than the silence.
+#[tokio::test(flavor = "multi_thread")]
+async fn progress_goes_on_after_letters_were_not_delivered() {
+    let hosts = TwoHosts::start(&["monitor.heartbeat=1s", "mts.deadline=1s"]).await;
+    let mut process = hosts.agent("robot").await;
+    let rover = hosts.domain.register("rover").await.unwrap();
+    let robot = rover.robot(AgentId::new("robot").unwrap());
+    let goal = loop {
+        // The first connection may need longer than a letter has.
+        match robot.invoke("hold", &()).await {
+            Ok(goal) => break goal,
+            Err(error) => println!("{error}"),
+        }
+    };
+    let mut progress = goal.progress().await.unwrap();
+    let mut step = async || {
+        let status = patient(progress.next()).await.unwrap().unwrap();
+        let note = status.progress.and_then(|it| it.note).unwrap();
+        note.parse::<u64>().unwrap()
+    };
+    step().await;
+    hosts.far.signal(Signal::STOP);
+    tokio::time::sleep(Duration::from_secs(4)).await;
+    hosts.far.signal(Signal::CONT);
+    let returned = Instant::now();
+    // Only a later letter than those that failed has it.
+    while step().await < 45 {
+        assert!(returned.elapsed() < TIMEOUT, "no further progress");
+    }
+    process.finish();
+    assert_eq!(goal.result::<String>().await.unwrap(), "done");
+}

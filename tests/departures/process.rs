@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::sync::mpsc;
 use std::time::Duration;
 
-use fipa::actions::Action;
+use fipa::actions::{Action, Execution, Progress};
 use fipa::protocol::{DialogueError, Reply, Task};
 use fipa::{Agent, AgentId, Config, Domain, Gateway, Incoming, Kind, Performative};
 use tokio::sync::Semaphore;
@@ -75,10 +75,22 @@ async fn robot(config: &Config, finish: &Arc<Semaphore>) {
     let domain = Domain::open(config).await.unwrap();
     let robot = domain.register("robot").await.unwrap();
     let finish = Arc::clone(finish);
-    let hold = move |(): (), _| {
+    let hold = move |(): (), run: Execution| {
         let finish = Arc::clone(&finish);
         async move {
-            finish.acquire().await.unwrap().forget();
+            for step in 0_u64.. {
+                run.progress(Progress {
+                    note: Some(step.to_string()),
+                    ..Progress::default()
+                });
+                tokio::select! {
+                    finished = finish.acquire() => {
+                        finished.unwrap().forget();
+                        break;
+                    }
+                    () = tokio::time::sleep(Duration::from_millis(100)) => {}
+                }
+            }
             Ok::<_, String>("done".to_owned())
         }
     };
