@@ -410,8 +410,8 @@ impl GoalHandle<'_> {
                     message = self.request.result() => break message,
                     again = self.robot.ask_again(&self.goal, &mut self.again) => again,
                 };
-                if matches!(again, Err(ActionError::Refused(_))) {
-                    self.again = None;
+                if again.is_err() {
+                    self.earlier.extend(self.again.take());
                 }
                 match again {
                     Ok(()) => {
@@ -450,20 +450,22 @@ impl GoalHandle<'_> {
         }
     }
 
-    /// Takes the answers to the earlier requests of a goal that is over.
+    /// Takes the answers to the earlier requests, which are not for the application.
     fn take_late_answers(&mut self) {
         let earlier = std::mem::take(&mut self.earlier).into_iter();
         let requests: Vec<Request> = earlier.chain(self.again.take()).collect();
-        if requests.is_empty() {
+        let inner = &self.robot.agent.domain().inner;
+        // In a forked child, the requests belong to the parent.
+        if requests.is_empty() || !inner.owner.is_this() {
             return;
         }
         let timeout = self.robot.timeout();
-        let runtime = &self.robot.agent.domain().inner.service.runtime;
-        runtime.spawn(async move {
+        let runtime = &inner.service.runtime;
+        runtime.spawn(tokio::time::timeout(timeout, async move {
             for mut request in requests {
-                let _late = tokio::time::timeout(timeout, request.result()).await;
+                let _late = request.result().await;
             }
-        });
+        }));
     }
 
     /// Cancels the goal, waits until the robot has stopped, and returns true. Returns false if the goal
@@ -473,6 +475,12 @@ impl GoalHandle<'_> {
     /// If the robot is gone, or does not answer within `timeout`.
     pub async fn cancel(&mut self, timeout: Duration) -> Result<bool, ActionError> {
         Ok(self.request.cancel(timeout).await?)
+    }
+}
+
+impl Drop for GoalHandle<'_> {
+    fn drop(&mut self) {
+        self.take_late_answers();
     }
 }
 
@@ -498,7 +506,7 @@ pub struct ProgressUpdates {
 }
 
 impl ProgressUpdates {
-    /// Waits for the next status of the goal, without a time limit. Returns the status with the end of the
+    /// Waits for the next status of the goal, without a time limit, also while the host of the robot is silent. Returns the status with the end of the
     /// goal, and then `None`. Dropping the future loses no status.
     ///
     /// # Errors
@@ -545,7 +553,7 @@ pub struct StatusUpdates {
 }
 
 impl StatusUpdates {
-    /// Waits for the next change, without a time limit, and returns the goals that run or wait. There are
+    /// Waits for the next change, without a time limit, also while the host of the robot is silent, and returns the goals that run or wait. There are
     /// at most ten notifications per second. Dropping the future loses no notification.
     ///
     /// # Errors

@@ -3,12 +3,13 @@
 use std::any::Any;
 use std::convert::Infallible;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_actions::{
     ActionAnswer, Ask, Failure, Goal, Language, MAX_CONTENT, ONTOLOGY, Refusal, language,
 };
+use fipa_transport::FailureReason;
 
 use crate::access::gate::RulesGate;
 use crate::actions::table::{ActionTable, Asking, Told};
@@ -20,6 +21,9 @@ const STATUS_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Pause after a notification that was not delivered.
 const UNDELIVERED_PAUSE: Duration = Duration::from_secs(1);
+
+/// Time without a delivery after which a subscription ends.
+const UNDELIVERED_TIMEOUT: Duration = Duration::from_secs(600);
 
 /// Starts the servers of an agent, unless they run.
 pub(super) fn start(core: &Arc<AgentCore>) -> Result<(), DialogueError> {
@@ -160,8 +164,7 @@ impl Side {
                     // The answer to the cancel comes first.
                     Some(Told::Agreed { queued }) if cancelled => late_agree = Some(queued),
                     Some(Told::Agreed { queued }) => {
-                        let sent = task.agree(agreed(queued)).await;
-                        if sent.is_err_and(|error| !is_undelivered(&error)) {
+                        if has_ended(task.agree(agreed(queued)).await) {
                             return Reply::Nothing;
                         }
                     }
@@ -196,11 +199,10 @@ impl Side {
                 {
                     return Reply::Nothing;
                 }
-                if let Some(queued) = late_agree {
-                    let sent = task.agree(agreed(queued)).await;
-                    if sent.is_err_and(|error| !is_undelivered(&error)) {
-                        return Reply::Nothing;
-                    }
+                if let Some(queued) = late_agree
+                    && has_ended(task.agree(agreed(queued)).await)
+                {
+                    return Reply::Nothing;
                 }
                 match self.language.unwrap_or(&fipa_actions::Sl).write_answer(
                     &self.robot,
@@ -229,7 +231,7 @@ impl Side {
             Err(reason) => return self.refuse(ask, reason),
         };
         let agreed = self.write(ask, &ActionAnswer::Agreed { queued: false });
-        if task.agree(agreed).await.is_err() {
+        if has_ended(task.agree(agreed).await) {
             return Reply::Nothing;
         }
         let mut ended = Vec::with_capacity(receivers.len());
@@ -276,20 +278,18 @@ impl Side {
             Ask::StatusOf(goal) => match self.table.watch(self.asking(), goal) {
                 Err(reason) => self.refuse(&ask, reason),
                 Ok(mut status) => {
-                    if task.agree("").await.is_err() {
+                    if has_ended(task.agree("").await) {
                         return Reply::Nothing;
                     }
+                    let mut undelivered = None;
                     loop {
                         let now = status.borrow_and_update().clone();
                         let is_over = now.state.is_over();
                         let content = self.write(&ask, &ActionAnswer::Status(vec![now]));
-                        match task.inform(content).await {
-                            Ok(()) => {}
-                            Err(error) if is_undelivered(&error) => tokio::select! {
-                                ended = ended(&mut task) => return ended,
-                                () = tokio::time::sleep(UNDELIVERED_PAUSE) => continue,
-                            },
-                            Err(_) => return Reply::Nothing,
+                        match notified(&mut task, content, &mut undelivered).await {
+                            Ok(true) => {}
+                            Ok(false) => continue,
+                            Err(end) => return end,
                         }
                         if is_over {
                             let end =
@@ -306,20 +306,18 @@ impl Side {
                 }
             },
             Ask::Status => {
-                if task.agree("").await.is_err() {
+                if has_ended(task.agree("").await) {
                     return Reply::Nothing;
                 }
                 let mut changes = self.table.changes();
+                let mut undelivered = None;
                 loop {
                     changes.mark_unchanged();
                     let content = self.write(&ask, &ActionAnswer::Status(self.table.status()));
-                    match task.inform(content).await {
-                        Ok(()) => {}
-                        Err(error) if is_undelivered(&error) => tokio::select! {
-                            ended = ended(&mut task) => return ended,
-                            () = tokio::time::sleep(UNDELIVERED_PAUSE) => continue,
-                        },
-                        Err(_) => return Reply::Nothing,
+                    match notified(&mut task, content, &mut undelivered).await {
+                        Ok(true) => {}
+                        Ok(false) => continue,
+                        Err(end) => return end,
                     }
                     let next = async {
                         tokio::time::sleep(STATUS_INTERVAL).await;
@@ -338,9 +336,48 @@ impl Side {
     }
 }
 
-/// Whether a message has not reached the client, whose host may be silent for a while.
-fn is_undelivered(error: &DialogueError) -> bool {
-    matches!(error, DialogueError::NotDelivered { .. })
+/// Whether the conversation has ended with this message. It goes on with a client that the message has not reached:
+/// its host may be silent for a while.
+fn has_ended(sent: Result<(), DialogueError>) -> bool {
+    match sent {
+        Ok(()) => false,
+        Err(DialogueError::NotDelivered { reason, .. }) => !matches!(
+            reason,
+            FailureReason::Unreachable
+                | FailureReason::TimedOut
+                | FailureReason::Unconfirmed
+                | FailureReason::QueueFull
+                | FailureReason::NoRoom
+                // By a limit of the rate.
+                | FailureReason::Refused
+        ),
+        Err(_) => true,
+    }
+}
+
+/// Sends a notification. Returns whether it was delivered; otherwise another one follows, after a pause. `undelivered`
+/// is the time of the first one that was not delivered since the last that was.
+///
+/// # Errors
+/// The end of the conversation.
+async fn notified(
+    task: &mut Task,
+    content: Vec<u8>,
+    undelivered: &mut Option<Instant>,
+) -> Result<bool, Reply> {
+    let sent = task.inform(content).await;
+    if sent.is_ok() {
+        *undelivered = None;
+        return Ok(true);
+    }
+    let since = *undelivered.get_or_insert_with(Instant::now);
+    if has_ended(sent) || since.elapsed() > UNDELIVERED_TIMEOUT {
+        return Err(Reply::Nothing);
+    }
+    tokio::select! {
+        ended = ended(task) => Err(ended),
+        () = tokio::time::sleep(UNDELIVERED_PAUSE) => Ok(false),
+    }
 }
 
 /// Whether an error while a client is awaited is a mistake of the client, which does not end the conversation.

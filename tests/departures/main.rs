@@ -408,13 +408,18 @@ async fn progress_goes_on_after_letters_were_not_delivered() {
     let mut process = hosts.agent("robot").await;
     let rover = hosts.domain.register("rover").await.unwrap();
     let robot = rover.robot(AgentId::new("robot").unwrap());
-    let goal = loop {
-        // The first connection may need longer than a letter has.
-        match robot.invoke("hold", &()).await {
-            Ok(goal) => break goal,
-            Err(error) => println!("{error}"),
+    let mut goal = robot.goal("hold", &()).unwrap();
+    goal.id = Some("first".to_owned());
+    let goal = patient(async {
+        loop {
+            // The first connection may need longer than a letter has.
+            match robot.send(goal.clone()).await {
+                Ok(goal) => break goal,
+                Err(error) => println!("{error}"),
+            }
         }
-    };
+    });
+    let goal = goal.await;
     let mut progress = goal.progress().await.unwrap();
     let mut step = async || {
         let status = patient(progress.next()).await.unwrap().unwrap();
