@@ -506,8 +506,8 @@ pub struct ProgressUpdates {
 }
 
 impl ProgressUpdates {
-    /// Waits for the next status of the goal, without a time limit, also while the host of the robot is silent. Returns the status with the end of the
-    /// goal, and then `None`. Dropping the future loses no status.
+    /// Waits for the next status of the goal, without a time limit, also while the host of the robot is silent. Returns
+    /// the status with the end of the goal, and then `None`. Dropping the future loses no status.
     ///
     /// # Errors
     /// If the robot is gone or ends the subscription.
@@ -553,8 +553,9 @@ pub struct StatusUpdates {
 }
 
 impl StatusUpdates {
-    /// Waits for the next change, without a time limit, also while the host of the robot is silent, and returns the goals that run or wait. There are
-    /// at most ten notifications per second. Dropping the future loses no notification.
+    /// Waits for the next change, without a time limit, also while the host of the robot is silent, and returns the
+    /// goals that run or wait. There are at most ten notifications per second. Dropping the future loses no
+    /// notification.
     ///
     /// # Errors
     /// If the robot is gone or ends the subscription.

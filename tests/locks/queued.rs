@@ -1,12 +1,11 @@
 //! The owner's queue between agents of several memberships: the owner names the algorithm, and requests survive its
 //! restart.
 
-use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use fipa::Agent;
 use fipa::locks::{Algorithm, LockError};
-use fipa::{Agent, Domain};
-use fipa_testbed::{until, until_async};
+use fipa_testbed::until_async;
 
 use super::support::{config, two};
 use super::{FOREVER, agent, agent_with, kept, watched};
@@ -86,7 +85,7 @@ async fn requests_that_wait_survive_a_restart_of_the_owner_in_their_order() {
         drop(bay);
         here.close().await;
         drop(crane);
-        let again = Domain::open(&config).await.unwrap();
+        let again = fipa::Domain::open(&config).await.unwrap();
         let crane = agent(&again, "crane").await;
         let bay = crane.own("bay", kept(&files, lease)).await.unwrap();
         assert!(!bay.admit(&fence));
@@ -98,59 +97,4 @@ async fn requests_that_wait_survive_a_restart_of_the_owner_in_their_order() {
         assert!(positions[0].0 > fence.epoch());
     })
     .await;
-}
-
-/// The time of the request ends in a pause of its process, in which the grant has arrived.
-#[test]
-fn a_grant_that_arrives_during_a_pause_is_not_too_late() {
-    let config = config(&[]);
-    let (near, far) = (
-        tokio::runtime::Builder::new_current_thread()
-            .enable_all()
-            .build()
-            .unwrap(),
-        tokio::runtime::Runtime::new().unwrap(),
-    );
-    let files = tempfile::tempdir().unwrap();
-    let (there, crane) = far.block_on(async {
-        let there = Domain::open(&config).await.unwrap();
-        let crane = agent(&there, "crane").await;
-        (there, crane)
-    });
-    let arm = far.block_on(agent(&there, "arm"));
-    let bay = far
-        .block_on(crane.own("bay", kept(&files, FOREVER)))
-        .unwrap();
-    let (here, rover) = near.block_on(async {
-        let here = Domain::open(&config).await.unwrap();
-        let rover = agent(&here, "rover").await;
-        (here, Arc::new(rover))
-    });
-    // Finds the owner.
-    let first = near.block_on(rover.lock("bay")).unwrap();
-    first.release();
-    near.block_on(until_async("the bay is free", || {
-        bay.status().holder.is_none()
-    }));
-    let within = Duration::from_secs(1);
-    // Whether the message or the timer is handled first is decided by chance.
-    for _ in 0..5 {
-        let held = far.block_on(arm.lock("bay")).unwrap();
-        let (asking, began) = (Arc::clone(&rover), Instant::now());
-        let lock = near.spawn(async move { asking.lock_within("bay", within).await });
-        near.block_on(until_async("the rover waits", || bay.status().waiting == 1));
-        held.release();
-        until("the rover has a grant", || {
-            bay.status().holder.as_deref() == Some("rover")
-        });
-        std::thread::sleep(within.saturating_sub(began.elapsed()) + Duration::from_millis(100));
-        let lock = near.block_on(lock).unwrap().unwrap();
-        assert!(lock.is_held());
-        lock.release();
-        near.block_on(until_async("the bay is free", || {
-            bay.status().holder.is_none()
-        }));
-    }
-    near.block_on(here.close());
-    far.block_on(there.close());
 }

@@ -80,9 +80,12 @@ class Conversations(Loops):
             self.assertEqual(bytes(self.rover.request(question, timeout=30).wait().content), b"pose")
 
     def test_requests_that_wait_for_a_server_are_answered(self) -> None:
-        for _ in range(10):
-            request = self.rover.begin_request(self.request("crate"), timeout=30)
-            with self.arm.serve("fipa-request", lambda task: "lifted"):
+        for number in range(10):
+            # A server that ends may still take a conversation, so each one has an agent of its own.
+            arm = self.domain.register(f"{self.arm.name}_{number}").wait()
+            message = fipa.Message("request", arm.name, "crate")
+            request = self.rover.begin_request(message, timeout=30)
+            with arm.serve("fipa-request", lambda task: "lifted"):
                 self.assertEqual(request.result().wait().text, "lifted")
 
     def test_a_handler_is_called_for_a_conversation_that_was_taken_before_the_end(self) -> None:

@@ -82,7 +82,8 @@ static inline fipa_item next(fipa_handle domain, uint64_t tag, int32_t kind) {
   return item;
 }
 
-/* Takes two items, which come in any order: returns the one of the first kind; the other has no handle. */
+/* Takes two items, which come in any order, also with progress between them: returns the one of the first kind; the
+   other has no handle. */
 static inline fipa_item both(fipa_handle domain, uint64_t tag, int32_t kind, uint64_t other_tag,
                              int32_t other) {
   fipa_item items[2], wanted;
@@ -90,6 +91,10 @@ static inline fipa_item both(fipa_handle domain, uint64_t tag, int32_t kind, uin
   for (int i = 0; i < 2; i++) {
     items[i].size = sizeof *items;
     OK(fipa_next(domain, LONG, &items[i]));
+    if (items[i].kind == FIPA_EVENT_PROGRESS) {
+      OK(fipa_close(items[i].handle));
+      i--;
+    }
   }
   wanted = items[0].kind == kind ? items[0] : items[1];
   CHECK(wanted.kind == kind && wanted.tag == tag);
