@@ -235,10 +235,11 @@ impl<'a> Robot<'a> {
     /// If the goal has no notation, or cannot be sent.
     pub async fn propose(&self, mut goal: Goal) -> Result<GoalHandle<'a>, ActionError> {
         goal.id.get_or_insert_with(|| self.agent.unique_id());
+        let ask = Ask::Goal(goal.clone());
         Ok(GoalHandle {
             robot: self.clone(),
-            request: self.request(&goal).await?,
-            ask: Ask::Goal(goal.clone()),
+            request: self.request(&goal, &ask).await?,
+            ask,
             goal,
             was_silent: false,
             again: None,
@@ -246,9 +247,9 @@ impl<'a> Robot<'a> {
         })
     }
 
-    async fn request(&self, goal: &Goal) -> Result<Request, ActionError> {
-        let ask = Ask::Goal(goal.clone());
-        let message = self.message(Performative::Request, &ask)?;
+    /// Sends a goal, which is also in `ask`.
+    async fn request(&self, goal: &Goal, ask: &Ask) -> Result<Request, ActionError> {
+        let message = self.message(Performative::Request, ask)?;
         let deadline = goal.deadline.map(Duration::from_millis);
         let timeout = deadline.and_then(|it| it.checked_add(GRACE + self.timeout()));
         let timeout = timeout.unwrap_or(Duration::MAX);
@@ -283,10 +284,15 @@ impl<'a> Robot<'a> {
     }
 
     /// Sends a goal again, unless that was done, and waits until the robot accepts it.
-    async fn ask_again(&self, goal: &Goal, again: &mut Option<Request>) -> Result<(), ActionError> {
+    async fn ask_again(
+        &self,
+        goal: &Goal,
+        ask: &Ask,
+        again: &mut Option<Request>,
+    ) -> Result<(), ActionError> {
         let request = match again {
             Some(request) => request,
-            None => again.insert(self.request(goal).await?),
+            None => again.insert(self.request(goal, ask).await?),
         };
         self.accepted(goal, request).await
     }
@@ -408,7 +414,7 @@ impl GoalHandle<'_> {
                 let again = tokio::select! {
                     biased;
                     message = self.request.result() => break message,
-                    again = self.robot.ask_again(&self.goal, &mut self.again) => again,
+                    again = self.robot.ask_again(&self.goal, &self.ask, &mut self.again) => again,
                 };
                 if again.is_err() {
                     self.earlier.extend(self.again.take());
@@ -443,15 +449,25 @@ impl GoalHandle<'_> {
                 () = tokio::time::sleep(self.robot.timeout()), if asks_again && self.was_silent => {}
             }
         };
-        self.take_late_answers();
         match read(self.robot.language, &self.ask, &message?)? {
             ActionAnswer::Done(value) => Ok(value),
             _ => Err(LanguageError::Form("a result").into()),
         }
     }
 
-    /// Takes the answers to the earlier requests, which are not for the application.
-    fn take_late_answers(&mut self) {
+    /// Cancels the goal, waits until the robot has stopped, and returns true. Returns false if the goal
+    /// has ended in the meantime or goes on; [`outcome`](Self::outcome) then returns its outcome.
+    ///
+    /// # Errors
+    /// If the robot is gone, or does not answer within `timeout`.
+    pub async fn cancel(&mut self, timeout: Duration) -> Result<bool, ActionError> {
+        Ok(self.request.cancel(timeout).await?)
+    }
+}
+
+impl Drop for GoalHandle<'_> {
+    /// Takes the late answers to the earlier requests.
+    fn drop(&mut self) {
         let earlier = std::mem::take(&mut self.earlier).into_iter();
         let requests: Vec<Request> = earlier.chain(self.again.take()).collect();
         let inner = &self.robot.agent.domain().inner;
@@ -466,21 +482,6 @@ impl GoalHandle<'_> {
                 let _late = request.result().await;
             }
         }));
-    }
-
-    /// Cancels the goal, waits until the robot has stopped, and returns true. Returns false if the goal
-    /// has ended in the meantime or goes on; [`outcome`](Self::outcome) then returns its outcome.
-    ///
-    /// # Errors
-    /// If the robot is gone, or does not answer within `timeout`.
-    pub async fn cancel(&mut self, timeout: Duration) -> Result<bool, ActionError> {
-        Ok(self.request.cancel(timeout).await?)
-    }
-}
-
-impl Drop for GoalHandle<'_> {
-    fn drop(&mut self) {
-        self.take_late_answers();
     }
 }
 

@@ -50,7 +50,8 @@ pub(crate) struct ActionTable(Arc<Shared>);
 #[derive(Default)]
 struct Shared {
     state: Mutex<State>,
-    /// What runs from the first offer until the end of the agent. Its lock comes before that of the state.
+    /// The servers and the timers, from the first offer until the end of the agent. This lock is taken before that of
+    /// `state`.
     serving: Mutex<Option<Serving>>,
     /// Notified when a timer is set that is due before the others.
     armed: Notify,
