@@ -40,7 +40,7 @@ pub enum ContactError {
 /// Bounded: a host has [`MAX_OF_HOST`](Self::MAX_OF_HOST) contacts at most, all hosts
 /// [`MAX_CONTACTS`](Self::MAX_CONTACTS). Beyond that, a new contact replaces another one: the first without a
 /// letter from this side, of the host with the most; otherwise the one without a letter in either direction for
-/// the longest time. The latest that were replaced are the [lost agents](Directory::lost_agents).
+/// the longest time. The latest that were replaced are the [lost agents](crate::View::lost_agents).
 ///
 /// A contact must not replace the entries of other back ends: merge this directory last, and drop a contact as
 /// soon as another back end has the agent ([`forget`](Self::forget)).
@@ -158,7 +158,7 @@ impl ContactDirectory {
     /// Time for which a contact is kept if its gateway sends the agents of its host and this agent is
     /// not among them: it has left.
     pub const UNLISTED: Duration = Duration::from_secs(5);
-    /// Number of replaced contacts that are known as [lost](Directory::lost_agents).
+    /// Number of replaced contacts that are known as [lost](crate::View::lost_agents).
     const MAX_REPLACED: usize = 256;
 
     /// Creates an empty directory.
@@ -278,12 +278,12 @@ impl ContactDirectory {
                 return Err(error);
             }
         };
+        let entry = Arc::new(entry);
+        self.table.put((), Arc::clone(&entry));
         if contacts.replaced.iter().any(|it| *it.name == *name) {
             contacts.replaced.retain(|it| *it.name != *name);
             self.table.set_lost(contacts.replaced.iter().cloned());
         }
-        let entry = Arc::new(entry);
-        self.table.put((), Arc::clone(&entry));
         contacts.uses += 1;
         let rank = Rank {
             is_pinned: contacts.pinned.contains(name),
@@ -305,7 +305,6 @@ impl ContactDirectory {
     /// Takes a contact that made room out of the directory. Its entry tells senders when.
     fn replace(&self, contacts: &mut Contacts, contact: Contact) -> Arc<Entry> {
         let entry = contact.entry;
-        self.table.release((), &entry.name, entry.incarnation);
         let lost = Arc::new(Entry {
             registered: time_of_millis(millis_of_time(SystemTime::now())),
             ..Entry::clone(&entry)
@@ -315,6 +314,7 @@ impl ContactDirectory {
         }
         contacts.replaced.push_back(Arc::clone(&lost));
         self.table.set_lost(contacts.replaced.iter().cloned());
+        self.table.release((), &entry.name, entry.incarnation);
         lost
     }
 
@@ -650,7 +650,7 @@ mod tests {
             "another host lost a contact"
         );
         assert_eq!(contacts.entries().len(), most + 1);
-        assert!(contacts.lost_agents().len() <= ContactDirectory::MAX_REPLACED);
+        assert!(contacts.view().lost_agents().len() <= ContactDirectory::MAX_REPLACED);
         // A letter makes a replaced one a contact again.
         fill(&contacts, 1, 3..4);
         assert!(contacts.lookup("1 3").is_some());

@@ -72,14 +72,6 @@ pub trait Directory: Send + Sync {
         matching.cloned().collect()
     }
 
-    /// Returns the last entries of agents that this directory listed until their gateway was gone. The
-    /// time of registration of such an entry is the time when the gateway was last seen. They are not
-    /// among the [entries](Self::entries). They tell an agent that cannot be reached from one that does
-    /// not exist, for one hour. Bounded by [`Exchange::MAX_LOST`](crate::Exchange::MAX_LOST).
-    fn lost_agents(&self) -> Vec<Arc<Entry>> {
-        Vec::new()
-    }
-
     /// Returns a number that changes whenever the directory or its [view](Self::view) changes. A
     /// change is complete when the number has changed.
     fn generation(&self) -> u64;

@@ -99,11 +99,6 @@ impl Directory for MergedDirectory {
         entries
     }
 
-    fn lost_agents(&self) -> Vec<Arc<Entry>> {
-        let back_ends = self.back_ends.iter();
-        back_ends.flat_map(|one| one.lost_agents()).collect()
-    }
-
     fn generation(&self) -> u64 {
         // Each generation only grows, so the sum changes whenever one of them does.
         self.generations().fold(0, u64::wrapping_add)
@@ -187,6 +182,11 @@ impl View for Merged {
 
     fn all(&self) -> Arc<[Arc<Entry>]> {
         Arc::clone(self.sorted.get_or_init(|| merged_entries(&self.views)))
+    }
+
+    fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        let views = self.views.iter();
+        views.flat_map(|one| one.lost_agents()).collect()
     }
 
     fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {

@@ -28,10 +28,6 @@ macro_rules! reads_its_table {
             self.$($field).+.entries()
         }
 
-        fn lost_agents(&self) -> Vec<Arc<Entry>> {
-            self.$($field).+.lost_agents()
-        }
-
         fn generation(&self) -> u64 {
             self.$($field).+.generation()
         }
@@ -135,11 +131,8 @@ impl<O: Clone + Eq + Hash> Table<O> {
         self.layers().all()
     }
 
-    pub(crate) fn lost_agents(&self) -> Vec<Arc<Entry>> {
-        self.index.read().holders.lost_agents()
-    }
-
-    /// Replaces the [lost agents](crate::Directory::lost_agents). Watchers are not notified.
+    /// Replaces the [lost agents](crate::View::lost_agents). Watchers are not notified. Call it before the entry of a
+    /// lost agent is removed, and after that of a returned one was inserted: no view is without both.
     pub(crate) fn set_lost(&self, lost: impl IntoIterator<Item = Arc<Entry>>) {
         let mut index = self.index.write();
         Arc::make_mut(&mut index.holders).set_lost(lost);
@@ -204,11 +197,16 @@ impl<O: Clone + Eq + Hash> Table<O> {
         }));
     }
 
-    /// Replaces the entries that hold the names that no origin claims. Watchers are notified by
+    /// Replaces the entries that hold the names that no origin claims, and the lost agents. Watchers are notified by
     /// [`changed_beneath`](Self::changed_beneath).
-    pub(crate) fn set_beneath(&self, beneath: Arc<dyn View>) {
+    pub(crate) fn set_beneath(
+        &self,
+        beneath: Arc<dyn View>,
+        lost: impl IntoIterator<Item = Arc<Entry>>,
+    ) {
         let mut index = self.index.write();
         index.beneath = Some(beneath);
+        Arc::make_mut(&mut index.holders).set_lost(lost);
         self.publish(&index);
         self.touch();
     }
@@ -457,6 +455,10 @@ impl View for Layers {
         let all = all.into();
         *cached = Some(Arc::downgrade(&all));
         all
+    }
+
+    fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        self.holders.lost_agents()
     }
 
     fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {

@@ -11,7 +11,8 @@ use crate::{Directory, Entry};
 /// The entries of a directory, for readers that must not wait.
 ///
 /// No method waits for another process. An entry of an agent of another host may be read from a file that
-/// is open and does not change. [`Directory::view`] returns a view that does not change. A directory is also a view of itself, which changes with it.
+/// is open and does not change. [`Directory::view`] returns a view that does not change. A directory is
+/// also a view of itself, which changes with it.
 pub trait View: Send + Sync {
     /// Returns the entry of exactly this name.
     fn named(&self, name: &str) -> Option<Arc<Entry>>;
@@ -22,7 +23,16 @@ pub trait View: Send + Sync {
     /// Returns all entries, sorted by name.
     fn all(&self) -> Arc<[Arc<Entry>]>;
 
-    /// Returns the last entry of a [lost agent](Directory::lost_agents) of this name.
+    /// Returns the last entries of agents that the directory listed until their gateway was gone. The
+    /// time of registration of such an entry is the time when the gateway was last seen. They are not
+    /// among the other entries. They tell an agent that cannot be reached from one that does not exist,
+    /// for one hour: an agent that leaves or returns is in each view either lost or listed. Bounded by
+    /// [`Exchange::MAX_LOST`](crate::Exchange::MAX_LOST).
+    fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        Vec::new()
+    }
+
+    /// Returns the last entry of a [lost agent](Self::lost_agents) of this name.
     fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
         let _ = name;
         None
@@ -55,10 +65,12 @@ impl<D: Directory + ?Sized> View for D {
         self.entries()
     }
 
+    fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        self.view().lost_agents()
+    }
+
     fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
-        self.lost_agents()
-            .into_iter()
-            .find(|lost| *lost.name == *name)
+        self.view().lost_agent(name)
     }
 
     fn is_authority(&self, mts: Incarnation) -> bool {
@@ -110,10 +122,6 @@ impl Snapshot {
     pub(crate) fn set_lost(&mut self, lost: impl IntoIterator<Item = Arc<Entry>>) {
         let lost = lost.into_iter();
         self.lost = lost.map(|entry| (Arc::clone(&entry.name), entry)).collect();
-    }
-
-    pub(crate) fn lost_agents(&self) -> Vec<Arc<Entry>> {
-        self.lost.values().cloned().collect()
     }
 
     /// Replaces the entry of a name.
@@ -209,6 +217,10 @@ impl View for Snapshot {
     fn registered(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
         let (entry, _) = self.incarnations.get(&incarnation)?;
         Some(Arc::clone(entry))
+    }
+
+    fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        self.lost.values().cloned().collect()
     }
 
     fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {

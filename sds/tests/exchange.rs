@@ -602,20 +602,20 @@ fn agents_of_a_gateway_that_is_gone_are_lost_for_an_hour() {
         "its gateway was last seen before: {ago:?}"
     );
     assert!(lost("leg").is_some() && lost("wheel").is_none());
-    assert_eq!(directory.lost_agents().len(), 2);
+    assert_eq!(directory.view().lost_agents().len(), 2);
     world.run(Exchange::LOST);
-    assert!(directory.lost_agents().is_empty());
+    assert!(directory.view().lost_agents().is_empty());
 
     // An agent that left in the meantime does not exist after its gateway has returned.
     world.connect();
     world.run(Duration::from_secs(20));
     disconnect(&mut world);
-    assert_eq!(directory.lost_agents().len(), 2);
+    assert_eq!(directory.view().lost_agents().len(), 2);
     world.leave(0, "leg");
     world.connect();
     world.run(Duration::from_secs(20));
     assert!(directory.lookup("arm").is_some() && directory.lookup("leg").is_none());
-    assert!(directory.lost_agents().is_empty());
+    assert!(directory.view().lost_agents().is_empty());
 
     // The agents of a gateway that says goodbye are lost at once.
     world.say_goodbye();
@@ -623,7 +623,7 @@ fn agents_of_a_gateway_that_is_gone_are_lost_for_an_hour() {
     let now = world.now;
     world.gateways[1].exchange.handle_neighbors(now, &[]);
     world.run(Exchange::MEMORY * 2);
-    assert_eq!(directory.lost_agents().len(), 1);
+    assert_eq!(directory.view().lost_agents().len(), 1);
 }
 
 /// Also those that another directory has, while the connection has not ended yet.
@@ -664,7 +664,7 @@ fn entries_of_a_gateway_without_trust_end_at_once() {
     world.run(Duration::from_secs(20));
     assert!(!lists("arm") && !lists("leg"));
     assert!(
-        directory.lost_agents().is_empty(),
+        directory.view().lost_agents().is_empty(),
         "a lost agent may return"
     );
 

@@ -49,6 +49,23 @@ fn fresh_dir() -> (tempfile::TempDir, PathBuf) {
     (parent, dir)
 }
 
+/// An agent of another host, as its gateway publishes it.
+fn of_another_host(name: &str) -> Entry {
+    Entry {
+        name: name.into(),
+        agent_type: "sensor".to_owned(),
+        incarnation: Incarnation::random(),
+        locations: vec!["shm://gateway".parse().unwrap()],
+        mts: MtsId::new("far-mts", Incarnation::random()),
+        description: String::new(),
+        registered: std::time::UNIX_EPOCH,
+        source: Source::Mdns,
+        reach: Reach::Local,
+        peer: fipa_transport::PeerId::THIS_HOST,
+        role: Role::Agent,
+    }
+}
+
 /// Another process of the domain: this test binary again, running only [`child_process`].
 struct Process {
     child: ChildGuard,
@@ -683,19 +700,7 @@ async fn inside_counters_of_an_ended_process_survive_a_full_disk() {
 async fn a_gateway_publishes_agents_of_other_hosts() {
     let (_parent, dir) = fresh_dir();
     let directory = open(&dir);
-    let entry = Entry {
-        name: "camera".into(),
-        agent_type: "sensor".to_owned(),
-        incarnation: Incarnation::random(),
-        locations: vec!["shm://gateway".parse().unwrap()],
-        mts: MtsId::new("far-mts", Incarnation::random()),
-        description: String::new(),
-        registered: std::time::UNIX_EPOCH,
-        source: Source::Mdns,
-        reach: Reach::Local,
-        peer: fipa_transport::PeerId::THIS_HOST,
-        role: Role::Agent,
-    };
+    let entry = of_another_host("camera");
     let denied = directory.publish_remote(&[Arc::new(entry.clone())], &[]);
     assert!(matches!(denied, Err(HostError::NoGateway)));
 
@@ -758,10 +763,42 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
         "lost agents end with the gateway that publishes them",
         || {
             third.refresh();
-            third.lost_agents().is_empty().then_some(())
+            third.view().lost_agents().is_empty().then_some(())
         },
     )
     .await;
+}
+
+/// A sender that finds an agent neither listed nor lost takes it for one that does not exist.
+#[tokio::test]
+async fn an_agent_that_is_lost_and_returns_is_known_all_the_time() {
+    const CHANGES: usize = 1000;
+    let (_parent, dir) = fresh_dir();
+    let gateway = HostDirectory::open(HostConfig {
+        gateway: true,
+        ..config(&dir)
+    })
+    .unwrap();
+    gateway.register(registration("gateway")).unwrap();
+    let camera = [Arc::new(of_another_host("camera"))];
+    gateway.publish_remote(&camera, &[]).unwrap();
+    let process = open(&dir);
+    assert!(process.lookup("camera").is_some());
+    std::thread::scope(|scope| {
+        let changes = scope.spawn(|| {
+            for change in 0..CHANGES {
+                match change % 2 {
+                    0 => gateway.publish_remote(&[], &camera).unwrap(),
+                    _ => gateway.publish_remote(&camera, &[]).unwrap(),
+                };
+                process.refresh();
+            }
+        });
+        while !changes.is_finished() {
+            let view = process.view();
+            assert!(view.named("camera").is_some() || view.lost_agent("camera").is_some());
+        }
+    });
 }
 
 #[tokio::test]

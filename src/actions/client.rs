@@ -17,6 +17,9 @@ use crate::protocol::{DialogueError, Notification, Reachability, Request, Subscr
 
 /// Time that a robot has beyond the deadline of a goal to stop and to report.
 const GRACE: Duration = Duration::from_secs(10);
+/// Time after which a robot is asked again, if the first request after a silence failed. It doubles up to the time that
+/// an answer may take.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
 
 /// The error of a call about actions.
 #[derive(Debug, thiserror::Error)]
@@ -242,6 +245,7 @@ impl<'a> Robot<'a> {
             ask,
             goal,
             was_silent: false,
+            pause: FIRST_PAUSE,
             again: None,
             earlier: Vec::new(),
         })
@@ -336,6 +340,8 @@ pub struct GoalHandle<'a> {
     request: Request,
     /// Whether the host of the robot was silent since the robot was asked last.
     was_silent: bool,
+    /// Time until the robot is asked again.
+    pause: Duration,
     /// A request that the robot has not accepted yet.
     again: Option<Request>,
     /// Those before the host of the robot was silent. Their late answers are not for the application.
@@ -408,7 +414,9 @@ impl GoalHandle<'_> {
         let mut reachability = self.request.reachability();
         let message = loop {
             let is_silent = !reachability.unreachable().is_empty();
-            self.was_silent |= is_silent;
+            if !self.was_silent {
+                (self.was_silent, self.pause) = (is_silent, FIRST_PAUSE);
+            }
             let asks_again = self.was_silent && !is_silent;
             if asks_again {
                 let again = tokio::select! {
@@ -446,7 +454,9 @@ impl GoalHandle<'_> {
                 biased;
                 message = self.request.result() => break message,
                 true = reachability.changed() => {}
-                () = tokio::time::sleep(self.robot.timeout()), if asks_again && self.was_silent => {}
+                () = tokio::time::sleep(self.pause), if asks_again && self.was_silent => {
+                    self.pause = self.robot.timeout().min(self.pause * 2);
+                }
             }
         };
         match read(self.robot.language, &self.ask, &message?)? {

@@ -86,7 +86,7 @@ impl<'a> DirectoryView<'a> {
     /// The time of registration of the entry is the time when the host was last seen.
     #[must_use]
     pub fn lost_agent(self, name: &str) -> Option<Arc<Entry>> {
-        let mut lost = self.0.lost_agents().into_iter();
+        let mut lost = self.0.view().lost_agents().into_iter();
         lost.find(|entry| *entry.name == *name && entry.source != Source::Contact)
     }
 

@@ -85,15 +85,17 @@ impl DirectorySync {
         // Read before the agents, so that a change in between causes another publication.
         let generations = self.generations();
         let locations = self.service.locations();
-        let (contacts, known) = (self.contacts.entries(), self.known.entries());
+        // An agent that leaves or returns meanwhile is in each view either lost or listed.
+        let (contacts, known) = (self.contacts.view(), self.known.view());
+        let (senders, listed) = (contacts.all(), known.all());
         let is_proved = |entry: &&Arc<Entry>| {
-            let mandate = self.known.mandate(entry.mts.incarnation);
+            let mandate = known.mandate_of(entry.mts.incarnation);
             mandate.is_proved()
         };
-        let (proved, unproved): (Vec<_>, Vec<_>) = known.iter().partition(is_proved);
+        let (proved, unproved): (Vec<_>, Vec<_>) = listed.iter().partition(is_proved);
         // The last entry holds a name and a registration: that of a directory, not of a contact, and a
         // proved one.
-        let all = contacts.iter().chain(unproved).chain(proved);
+        let all = senders.iter().chain(unproved).chain(proved);
         let through_here = all
             .filter(|entry| entry.role != Role::Gateway)
             .map(|entry| match self.is_unsupported(entry) {
@@ -105,8 +107,8 @@ impl DirectorySync {
                 }),
             });
         let through_here: Vec<Arc<Entry>> = through_here.collect();
-        let mut lost = self.known.lost_agents();
-        lost.extend(self.contacts.lost_agents());
+        let mut lost = known.lost_agents();
+        lost.extend(contacts.lost_agents());
         let written = self.host.publish_remote(&through_here, &lost);
         let size = *written.as_ref().unwrap_or(&0);
         self.pace.lock().wrote(Instant::now(), size);

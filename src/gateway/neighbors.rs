@@ -520,6 +520,10 @@ impl DirectoryView for PresentView {
         self.all.all()
     }
 
+    fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        self.all.lost_agents()
+    }
+
     fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {
         self.all.lost_agent(name)
     }

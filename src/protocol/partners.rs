@@ -67,6 +67,8 @@ struct Partner {
     unanswered: Option<Instant>,
     /// Whether the gateway of the agent cannot be asked.
     is_unsupported: bool,
+    /// Whether the directory has the entry: no letter reaches an agent without one.
+    is_listed: bool,
     /// Whether a question is due because the entry has left the directory.
     is_doubted: bool,
     /// The time of the event that the agent is gone.
@@ -96,6 +98,7 @@ impl Partners {
         self.remove(name);
         self.all.push(Partner {
             name: name.into(),
+            is_listed: entry.is_some(),
             entry,
             heard: now,
             asked: None,
@@ -180,7 +183,7 @@ impl Partners {
                 continue;
             };
             if answer.here.contains(&id) {
-                partner.lives(now);
+                partner.answers(now);
             }
             if answer.gone.contains(&id) {
                 partner.ends(now);
@@ -271,6 +274,7 @@ impl Partner {
             // The entry left between the delivery of the first message and the first look-up.
             None => self.entry = Some(Arc::clone(entry)),
         }
+        self.is_listed = false;
         match entry.reach {
             Reach::Local => self.ends(now),
             Reach::Remote { .. } => self.is_doubted = true,
@@ -281,11 +285,13 @@ impl Partner {
     fn registered(&mut self, now: Instant, after: &Arc<Entry>) {
         let Some(before) = &self.entry else {
             self.entry = Some(Arc::clone(after));
+            self.is_listed = true;
             return;
         };
         let is_same = before.incarnation == after.incarnation;
         if is_same || is_move(before, after) {
-            if is_same && self.is_doubted {
+            let was_listed = std::mem::replace(&mut self.is_listed, true);
+            if is_same && !was_listed {
                 self.lives(now);
             }
             self.entry = Some(Arc::clone(after));
@@ -301,9 +307,15 @@ impl Partner {
     }
 
     fn lives(&mut self, now: Instant) {
+        self.answers(now);
+        self.has_returned |= std::mem::take(&mut self.is_silent);
+    }
+
+    /// Handles an answer of its gateway, which comes before the directory has the entry again: letters fail until then.
+    fn answers(&mut self, now: Instant) {
         self.heard = now;
         self.unanswered = None;
-        self.has_returned |= std::mem::take(&mut self.is_silent);
+        self.has_returned |= self.is_listed && std::mem::take(&mut self.is_silent);
     }
 
     /// Returns the time of the next question.
@@ -499,6 +511,31 @@ mod tests {
         );
         assert_eq!(partners.unreachable().next(), None);
         assert_eq!(partners.all_gone(), None);
+    }
+
+    /// Letters to it would fail.
+    #[test]
+    fn an_agent_that_the_directory_has_lost_returns_with_its_entry() {
+        let (mut partners, at) = with(Some(remote(1, "crex-mts")));
+        partners.handle_change(at(0), &Change::Left(remote(1, "crex-mts")));
+        assert_eq!(partners.poll_question(at(0)).len(), 1);
+        let silent = partners.poll_event(at(4000));
+        assert!(matches!(silent, Some(PartnerEvent::Unreachable { .. })));
+        partners.handle_answer(at(4500), &here(1));
+        assert_eq!(partners.poll_event(at(4500)), None);
+        assert_eq!(partners.unreachable().count(), 1);
+        partners.handle_change(at(4600), &Change::Joined(remote(1, "crex-mts")));
+        let agent = "arm".to_owned();
+        assert_eq!(
+            partners.poll_event(at(4600)),
+            Some(PartnerEvent::Returned { agent })
+        );
+        // A message reaches this agent, and so does an answer to it.
+        partners.handle_change(at(5000), &Change::Left(remote(1, "crex-mts")));
+        assert_eq!(partners.poll_question(at(5000)).len(), 1);
+        assert!(partners.poll_event(at(9000)).is_some());
+        partners.handle_message(at(9001), "arm");
+        assert_eq!(partners.unreachable().count(), 0);
     }
 
     #[test]

@@ -99,7 +99,7 @@ impl LaneTable {
     }
 
     /// The reason for which a letter to an agent fails that the directory does not list. For a [lost
-    /// agent](fipa_sds::Directory::lost_agents), the attempt names the location of its gateway.
+    /// agent](fipa_sds::View::lost_agents), the attempt names the location of its gateway.
     pub(super) fn absence(&self, name: &str) -> (FailureReason, Option<Attempt>) {
         let Some(lost) = self.view.lost_agent(name) else {
             return (FailureReason::NoSuchAgent, None);

@@ -371,7 +371,7 @@ impl ExchangeDirectory {
         any
     }
 
-    /// Replaces the [lost agents](Directory::lost_agents).
+    /// Replaces the [lost agents](View::lost_agents).
     pub(super) fn set_lost(&self, lost: impl IntoIterator<Item = Arc<Entry>>) {
         self.table.set_lost(lost);
     }
@@ -423,6 +423,10 @@ impl View for ExchangeView {
 
     fn all(&self) -> Arc<[Arc<Entry>]> {
         self.entries.all()
+    }
+
+    fn lost_agents(&self) -> Vec<Arc<Entry>> {
+        self.entries.lost_agents()
     }
 
     fn lost_agent(&self, name: &str) -> Option<Arc<Entry>> {

@@ -235,7 +235,7 @@ impl Exchange {
     /// Time for which the agents of a disconnected neighbor are kept: a broken connection is
     /// usually restored.
     pub const MEMORY: Duration = Duration::from_secs(5);
-    /// Time for which agents are [lost](crate::Directory::lost_agents) after that.
+    /// Time for which agents are [lost](crate::View::lost_agents) after that.
     pub const LOST: Duration = Duration::from_secs(3600);
     /// Maximum number of lost agents. Beyond it, the lists of the peers with most are cut.
     pub const MAX_LOST: usize = 1024;

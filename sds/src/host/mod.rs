@@ -160,7 +160,7 @@ impl HostDirectory {
     /// host, in which they appear as [`Reach::Remote`](crate::Reach::Remote) through this gateway. Their locations are
     /// those at which the gateway accepts letters for them. This directory's own view does not
     /// contain them. Processes of this host see `lost` as their [lost
-    /// agents](Directory::lost_agents).
+    /// agents](crate::View::lost_agents).
     ///
     /// Of several entries with one name or one incarnation, the last one holds that. Entries that are not valid
     /// are left out. So are those for which there is no room, from the gateways that have most.

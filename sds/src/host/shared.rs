@@ -369,8 +369,8 @@ impl Shared {
             .0
             .iter()
             .flat_map(|agents| agents.lost_agents().to_vec());
-        self.table.set_lost(lost.collect::<Vec<_>>());
-        self.table.set_beneath(Arc::clone(&later) as Arc<dyn View>);
+        self.table
+            .set_beneath(Arc::clone(&later) as Arc<dyn View>, lost);
         if !self.table.is_watched() {
             return;
         }
