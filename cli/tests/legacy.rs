@@ -172,12 +172,17 @@ fn failure_messages_beyond_a_limit_are_counted_in_the_log() {
     let host = Host::new();
     let mut gateway = host.start(&["up", "--json"]);
     let to = gateway.tcp_address();
-    for _ in 0..200 {
-        let mut stream = TcpStream::connect(&to).unwrap();
-        stream.write_all(LETTER).unwrap();
-        stream.shutdown(Shutdown::Write).unwrap();
-        // The gateway closes the connection after it has read the letter.
-        let _ = stream.read_to_end(&mut Vec::new());
+    // The limit is a number per second, so several arrive at once.
+    for _ in 0..10 {
+        let streams: [_; 20] = std::array::from_fn(|_| TcpStream::connect(&to).unwrap());
+        for mut stream in &streams {
+            stream.write_all(LETTER).unwrap();
+            stream.shutdown(Shutdown::Write).unwrap();
+        }
+        // The gateway closes a connection after it has read the letter.
+        for mut stream in &streams {
+            let _ = stream.read_to_end(&mut Vec::new());
+        }
     }
     gateway.wait_for_log(&[
         "failure messages beyond a limit are counted in one message to their sender",

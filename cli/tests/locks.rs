@@ -100,7 +100,7 @@ fn the_lock_of_a_killed_holder_is_granted_and_its_late_command_refused() {
             .starts_with(&format!("admitted with {stale}: (request"))
     );
 
-    let late = host.run(&["lock", "bay", "--within", "3s", "--", "true"]);
+    let late = host.run(&["lock", "bay", "--within", "10s", "--", "true"]);
     let late = late.failed(124);
     let problem = "timed out waiting for \"bay\", with 1 request ahead\nwhere: resource \"bay\", held by \"rover\"";
     assert!(late.contains(problem), "{late}");

@@ -765,7 +765,7 @@ fn an_abandoned_lock_is_in_the_log() {
     ]);
     let fence = holder.ready.trim().to_owned();
     let late = [
-        "lock", "bay", "--agent", "loader", "--within", "3s", "--", "true",
+        "lock", "bay", "--agent", "loader", "--within", "10s", "--", "true",
     ];
     assert_eq!(host.run(&late).code, Some(124));
     holder.send_signal("-TERM");

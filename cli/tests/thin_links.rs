@@ -14,8 +14,8 @@ use fipa_testbed::{ChildGuard, Family, Network, directory, enter, isolated, unti
 use hosts::PORT;
 use serde_json::Value;
 
-/// Length of a large letter: it takes more than three seconds.
-const LARGE: usize = 4 << 20;
+/// Length of a large letter: it takes more than ten seconds, and the commands that send small ones take less.
+const LARGE: usize = 12 << 20;
 
 /// Defines a test, and the ignored test that it runs in namespaces.
 macro_rules! on_a_thin_link {

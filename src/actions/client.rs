@@ -11,15 +11,19 @@ use fipa_actions::{
 use fipa_content::{DeserializeError, Term};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use tokio::time::Instant;
 
 use crate::agent::Agent;
 use crate::protocol::{DialogueError, Notification, Reachability, Request, Subscription};
 
 /// Time that a robot has beyond the deadline of a goal to stop and to report.
 const GRACE: Duration = Duration::from_secs(10);
-/// Time after which a robot is asked again, if the first request after a silence failed. It doubles up to the time that
-/// an answer may take.
+/// Time after which a robot is asked again, if the request before failed. It doubles up to the time that an answer may
+/// take.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
+/// Maximum time between two questions for the status of a goal whose result is awaited. The robot stores an ended goal
+/// for ten minutes.
+const QUESTION: Duration = Duration::from_secs(60);
 
 /// The error of a call about actions.
 #[derive(Debug, thiserror::Error)]
@@ -244,8 +248,10 @@ impl<'a> Robot<'a> {
             request: self.request(&goal, &ask).await?,
             ask,
             goal,
-            was_silent: false,
+            asks_again: false,
             pause: FIRST_PAUSE,
+            next_question: Instant::now() + self.question_interval(),
+            question: None,
             again: None,
             earlier: Vec::new(),
         })
@@ -287,6 +293,39 @@ impl<'a> Robot<'a> {
         }
     }
 
+    /// Asks for the status of a goal when it is time, unless that was done, and waits for the answer. Returns whether the
+    /// goal has ended.
+    async fn reports_end(
+        &self,
+        goal: &Goal,
+        next: Instant,
+        question: &mut Option<Request>,
+    ) -> bool {
+        let ask = Ask::StatusOf(goal.id.as_deref().unwrap_or_default().into());
+        let question = match question {
+            Some(question) => question,
+            None => {
+                tokio::time::sleep_until(next).await;
+                // Without a timeout: a late answer is not for the application.
+                match self.ask(&ask, Duration::MAX).await {
+                    Ok(asked) => question.insert(asked),
+                    Err(_) => return false,
+                }
+            }
+        };
+        let answer = question.result().await.map_err(ActionError::from);
+        let answer = answer.and_then(|it| read(self.language, &ask, &it));
+        match answer {
+            Ok(ActionAnswer::Status(all)) => all.first().is_some_and(|it| it.state.is_over()),
+            _ => false,
+        }
+    }
+
+    /// Time between two questions for the status of a goal.
+    fn question_interval(&self) -> Duration {
+        QUESTION.min(self.timeout() * 10)
+    }
+
     /// Sends a goal again, unless that was done, and waits until the robot accepts it.
     async fn ask_again(
         &self,
@@ -313,10 +352,14 @@ impl<'a> Robot<'a> {
     }
 
     async fn query(&self, ask: &Ask) -> Result<ActionAnswer, ActionError> {
-        let message = self.message(Performative::QueryRef, ask)?;
-        let mut request = self.agent.query(message, self.timeout()).await?;
-        let answer = request.result().await?;
+        let mut question = self.ask(ask, self.timeout()).await?;
+        let answer = question.result().await?;
         read(self.language, ask, &answer)
+    }
+
+    async fn ask(&self, ask: &Ask, timeout: Duration) -> Result<Request, ActionError> {
+        let message = self.message(Performative::QueryRef, ask)?;
+        Ok(self.agent.query(message, timeout).await?)
     }
 }
 
@@ -338,10 +381,14 @@ pub struct GoalHandle<'a> {
     goal: Goal,
     ask: Ask,
     request: Request,
-    /// Whether the host of the robot was silent since the robot was asked last.
-    was_silent: bool,
-    /// Time until the robot is asked again.
+    /// Whether the robot is to be asked again: its host was silent, or the goal has ended and no result has arrived.
+    asks_again: bool,
+    /// Time until the robot is asked again, if the request before failed.
     pause: Duration,
+    /// Time of the next question for the status.
+    next_question: Instant,
+    /// A question for the status that has no answer yet.
+    question: Option<Request>,
     /// A request that the robot has not accepted yet.
     again: Option<Request>,
     /// Those before the host of the robot was silent. Their late answers are not for the application.
@@ -405,8 +452,8 @@ impl GoalHandle<'_> {
     }
 
     /// Waits for the result as a term, `None` for an action without one. Dropping the future loses
-    /// nothing. If the host of the robot was silent and returns, the robot is asked again: it may have failed to
-    /// deliver the result.
+    /// nothing. The robot may have failed to deliver the result: it is asked again if its host was silent and returns,
+    /// and after some time without a result it is asked whether the goal has ended.
     ///
     /// # Errors
     /// See [`result`](Self::result).
@@ -414,11 +461,9 @@ impl GoalHandle<'_> {
         let mut reachability = self.request.reachability();
         let message = loop {
             let is_silent = !reachability.unreachable().is_empty();
-            if !self.was_silent {
-                (self.was_silent, self.pause) = (is_silent, FIRST_PAUSE);
-            }
-            let asks_again = self.was_silent && !is_silent;
-            if asks_again {
+            self.asks_again |= is_silent;
+            let asks_now = self.asks_again && !is_silent;
+            if asks_now {
                 let again = tokio::select! {
                     biased;
                     message = self.request.result() => break message,
@@ -434,11 +479,13 @@ impl GoalHandle<'_> {
                             let earlier = std::mem::replace(&mut self.request, again);
                             self.earlier.push(earlier);
                         }
-                        self.was_silent = false;
+                        (self.asks_again, self.pause) = (false, FIRST_PAUSE);
                         continue;
                     }
                     // The robot has the goal, and answers the requests that there are.
-                    Err(ActionError::Refused(Refusal::TooManyGoals)) => self.was_silent = false,
+                    Err(ActionError::Refused(Refusal::TooManyGoals)) => {
+                        (self.asks_again, self.pause) = (false, FIRST_PAUSE);
+                    }
                     Err(ActionError::Dialogue(
                         DialogueError::NotDelivered { .. }
                         | DialogueError::TimedOut
@@ -454,8 +501,13 @@ impl GoalHandle<'_> {
                 biased;
                 message = self.request.result() => break message,
                 true = reachability.changed() => {}
-                () = tokio::time::sleep(self.pause), if asks_again && self.was_silent => {
+                () = tokio::time::sleep(self.pause), if asks_now && self.asks_again => {
                     self.pause = self.robot.timeout().min(self.pause * 2);
+                }
+                is_over = self.robot.reports_end(&self.goal, self.next_question, &mut self.question), if !self.asks_again => {
+                    self.question = None;
+                    self.next_question = Instant::now() + self.robot.question_interval();
+                    self.asks_again = is_over;
                 }
             }
         };
@@ -476,10 +528,11 @@ impl GoalHandle<'_> {
 }
 
 impl Drop for GoalHandle<'_> {
-    /// Takes the late answers to the earlier requests.
+    /// Takes the late answers to the other requests.
     fn drop(&mut self) {
         let earlier = std::mem::take(&mut self.earlier).into_iter();
-        let requests: Vec<Request> = earlier.chain(self.again.take()).collect();
+        let others = self.again.take().into_iter().chain(self.question.take());
+        let requests: Vec<Request> = earlier.chain(others).collect();
         let inner = &self.robot.agent.domain().inner;
         // In a forked child, the requests belong to the parent.
         if requests.is_empty() || !inner.owner.is_this() {

@@ -164,7 +164,7 @@ impl Side {
                     // The answer to the cancel comes first.
                     Some(Told::Agreed { queued }) if cancelled => late_agree = Some(queued),
                     Some(Told::Agreed { queued }) => {
-                        if has_ended(task.agree(agreed(queued)).await) {
+                        if has_ended(task.agree(agreed(queued)).await, &task) {
                             return Reply::Nothing;
                         }
                     }
@@ -200,7 +200,7 @@ impl Side {
                     return Reply::Nothing;
                 }
                 if let Some(queued) = late_agree
-                    && has_ended(task.agree(agreed(queued)).await)
+                    && has_ended(task.agree(agreed(queued)).await, &task)
                 {
                     return Reply::Nothing;
                 }
@@ -231,7 +231,7 @@ impl Side {
             Err(reason) => return self.refuse(ask, reason),
         };
         let agreed = self.write(ask, &ActionAnswer::Agreed { queued: false });
-        if has_ended(task.agree(agreed).await) {
+        if has_ended(task.agree(agreed).await, &task) {
             return Reply::Nothing;
         }
         let mut ended = Vec::with_capacity(receivers.len());
@@ -278,7 +278,7 @@ impl Side {
             Ask::StatusOf(goal) => match self.table.watch(self.asking(), goal) {
                 Err(reason) => self.refuse(&ask, reason),
                 Ok(mut status) => {
-                    if has_ended(task.agree("").await) {
+                    if has_ended(task.agree("").await, &task) {
                         return Reply::Nothing;
                     }
                     let mut undelivered = None;
@@ -306,7 +306,7 @@ impl Side {
                 }
             },
             Ask::Status => {
-                if has_ended(task.agree("").await) {
+                if has_ended(task.agree("").await, &task) {
                     return Reply::Nothing;
                 }
                 let mut changes = self.table.changes();
@@ -338,9 +338,13 @@ impl Side {
 
 /// Whether the conversation has ended with this message. It goes on with a client that the message has not reached:
 /// its host may be silent for a while.
-fn has_ended(sent: Result<(), DialogueError>) -> bool {
+fn has_ended(sent: Result<(), DialogueError>, task: &Task) -> bool {
     match sent {
         Ok(()) => false,
+        Err(DialogueError::NotDelivered {
+            reason: FailureReason::NoSuchAgent,
+            ..
+        }) => !task.may_return(),
         Err(DialogueError::NotDelivered { reason, .. }) => !matches!(
             reason,
             FailureReason::Unreachable
@@ -371,7 +375,7 @@ async fn notified(
         return Ok(true);
     }
     let since = *undelivered.get_or_insert_with(Instant::now);
-    if has_ended(sent) || since.elapsed() > UNDELIVERED_TIMEOUT {
+    if has_ended(sent, task) || since.elapsed() > UNDELIVERED_TIMEOUT {
         return Err(Reply::Nothing);
     }
     tokio::select! {

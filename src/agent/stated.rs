@@ -140,23 +140,31 @@ impl Introductions {
         if let Some(why) = self.refusal(Instant::now(), &key) {
             return Err(why);
         }
-        let asked = ask(domain, id, timeout.min(TIMEOUT)).await;
+        // Not remembered: a gateway may start at any moment.
+        let gateway = gateway_of(domain)?;
+        let asked = ask(domain, &gateway, id, timeout.min(TIMEOUT)).await;
         let asked = asked.map_err(Arc::from);
         self.remember(Instant::now(), key, &asked);
         asked
     }
 }
 
-async fn ask(domain: &Domain, id: &AgentId, timeout: Duration) -> Result<(), String> {
+/// Returns the entry of the gateway of this host.
+fn gateway_of(domain: &Domain) -> Result<Arc<Entry>, Arc<str>> {
     let entries = domain.inner.service.host.entries();
     let is_own = |entry: &&Arc<Entry>| entry.role == Role::Gateway && entry.reach == Reach::Local;
-    let Some(gateway) = entries.iter().find(is_own) else {
-        return Err(
-            "no gateway is running on this host, and only gateways reach other platforms; start \
-             one with `fipa up`"
-                .to_owned(),
-        );
-    };
+    let gateway = entries.iter().find(is_own).cloned();
+    gateway.ok_or_else(|| {
+        "no gateway is running on this host, and only gateways reach other platforms; start one with `fipa up`".into()
+    })
+}
+
+async fn ask(
+    domain: &Domain,
+    gateway: &Entry,
+    id: &AgentId,
+    timeout: Duration,
+) -> Result<(), String> {
     let options = RegisterOptions {
         agent_type: routes::ASKER_TYPE.to_owned(),
         ..RegisterOptions::default()

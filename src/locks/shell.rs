@@ -10,8 +10,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, ErrorChain, Performative, escape, escape_name};
 use fipa_locking::{
-    Action, Algorithm, AnyAlgorithm, ClaimId, Event, Failure, Fence, LockDialect, LockMessage,
-    LockPeer, Locks, Millis, Resource, codec,
+    Act, Action, Algorithm, AnyAlgorithm, ClaimId, Content, Event, Failure, Fence, LockDialect,
+    LockMessage, LockPeer, Locks, Millis, Resource, codec,
 };
 use fipa_mts::letter_for;
 use fipa_sds::{Change, Entry, Reach, Role, Watch};
@@ -591,6 +591,19 @@ impl RunningLocks for Shared {
 }
 
 impl State {
+    /// Whether a message asks for a resource that this agent prepares to own. The directory may list it already.
+    fn is_about_to_own(&self, message: &LockMessage) -> bool {
+        let Content::Lock { resource, act } = &message.content else {
+            return false;
+        };
+        let is_reserved = self
+            .owned
+            .get(resource)
+            .is_some_and(|it| *it.holding.borrow() == Holding::Preparing);
+        let asks = matches!(act, Act::Ask { .. } | Act::Confirm { asked: Some(_) });
+        asks && is_reserved && self.core.owner(resource).is_none()
+    }
+
     /// Has the task watch a member.
     fn note(&mut self, peer: &LockPeer) {
         if self.core.is_member(peer) {
@@ -705,6 +718,10 @@ impl Task {
             }
         };
         self.shared.act(&self.core, |state, now, actions| {
+            if state.is_about_to_own(&decoded) {
+                // The sender asks again.
+                return;
+            }
             let was_member = state.core.is_member(&from);
             state.core.handle(now, &from, &decoded, actions);
             if !was_member {

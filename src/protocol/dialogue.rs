@@ -360,6 +360,12 @@ impl Dialogue {
         self.partners.all_gone().is_some()
     }
 
+    /// Whether a partner that the directory does not have may be there again later: while no gateway runs on this host,
+    /// no agent of another host is known. The event that it is gone follows otherwise.
+    pub(crate) fn may_return(&self) -> bool {
+        self.partners.may_return()
+    }
+
     /// Returns a receiver of changes of the reachability of the partners.
     pub(super) fn reachability(&self) -> Reachability {
         self.reachability.subscribe()

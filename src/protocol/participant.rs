@@ -191,6 +191,12 @@ impl Task {
         })
     }
 
+    /// See [`Dialogue::may_return`].
+    #[cfg(feature = "actions")]
+    pub(crate) fn may_return(&self) -> bool {
+        self.dialogue.may_return()
+    }
+
     /// Returns the last message of the initiator.
     #[must_use]
     pub fn message(&self) -> &Message {

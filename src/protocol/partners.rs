@@ -124,6 +124,11 @@ impl Partners {
         all.then_some(&*last.name)
     }
 
+    /// Whether an agent of another host may have left the directory for a while only: its gateway tells when it is gone.
+    pub(crate) fn may_return(&self) -> bool {
+        self.all.iter().any(Partner::is_asked_for)
+    }
+
     /// Returns the agents that are unreachable now, with the time of their last sign of life.
     pub(crate) fn unreachable(&self) -> impl Iterator<Item = (&str, Instant)> {
         let silent = self.all.iter().filter(|it| it.is_silent && !it.is_gone);
@@ -189,8 +194,8 @@ impl Partners {
                 partner.ends(now);
             }
             if answer.unsupported.contains(&id) {
-                partner.lives(now);
                 partner.is_unsupported = true;
+                partner.answers(now);
             }
         }
     }
@@ -275,6 +280,8 @@ impl Partner {
             None => self.entry = Some(Arc::clone(entry)),
         }
         self.is_listed = false;
+        // The event that it has returned is not true any more.
+        self.is_silent |= std::mem::take(&mut self.has_returned);
         match entry.reach {
             Reach::Local => self.ends(now),
             Reach::Remote { .. } => self.is_doubted = true,
@@ -291,9 +298,10 @@ impl Partner {
         let is_same = before.incarnation == after.incarnation;
         if is_same || is_move(before, after) {
             let was_listed = std::mem::replace(&mut self.is_listed, true);
-            if is_same && !was_listed {
+            if !is_same || !was_listed {
                 self.lives(now);
             }
+            self.is_unsupported &= is_same;
             self.entry = Some(Arc::clone(after));
             (self.gone, self.is_doubted) = (None, false);
         } else {
@@ -318,13 +326,19 @@ impl Partner {
         self.has_returned |= self.is_listed && std::mem::take(&mut self.is_silent);
     }
 
+    /// Whether its gateway is asked for it.
+    fn is_asked_for(&self) -> bool {
+        let can_answer = |entry: &Arc<Entry>| {
+            let is_remote = matches!(entry.reach, Reach::Remote { .. });
+            is_remote && entry.incarnation.is_known() && entry.mts.incarnation.is_known()
+        };
+        let is_over = self.is_gone || self.gone.is_some() || self.is_unsupported;
+        self.entry.as_ref().is_some_and(can_answer) && !is_over
+    }
+
     /// Returns the time of the next question.
     fn question(&self, interval: Duration) -> Option<Instant> {
-        let entry = self.entry.as_ref()?;
-        let is_remote = matches!(entry.reach, Reach::Remote { .. });
-        let can_answer = entry.incarnation.is_known() && entry.mts.incarnation.is_known();
-        let is_over = self.is_gone || self.gone.is_some() || self.is_unsupported;
-        if !is_remote || !can_answer || is_over {
+        if !self.is_asked_for() {
             return None;
         }
         if self.is_doubted {
@@ -530,12 +544,37 @@ mod tests {
             partners.poll_event(at(4600)),
             Some(PartnerEvent::Returned { agent })
         );
-        // A message reaches this agent, and so does an answer to it.
-        partners.handle_change(at(5000), &Change::Left(remote(1, "crex-mts")));
-        assert_eq!(partners.poll_question(at(5000)).len(), 1);
+        // It leaves the directory again before the event that it has returned.
+        partners.handle_change(at(4700), &Change::Left(remote(1, "crex-mts")));
+        assert_eq!(partners.poll_question(at(4700)).len(), 1);
         assert!(partners.poll_event(at(9000)).is_some());
-        partners.handle_message(at(9001), "arm");
+        partners.handle_change(at(9001), &Change::Joined(remote(1, "crex-mts")));
+        partners.handle_change(at(9001), &Change::Left(remote(1, "crex-mts")));
+        assert_eq!(partners.poll_event(at(9001)), None);
+        assert_eq!(partners.unreachable().count(), 1);
+        partners.handle_change(at(9002), &Change::Joined(remote(1, "crex-mts")));
+        assert!(partners.poll_event(at(9002)).is_some());
+    }
+
+    #[test]
+    fn a_silent_agent_that_sends_a_message_or_moves_has_returned() {
+        let silent = || {
+            let (mut partners, at) = with(Some(remote(1, "crex-mts")));
+            partners.handle_change(at(0), &Change::Left(remote(1, "crex-mts")));
+            assert_eq!(partners.poll_question(at(0)).len(), 1);
+            assert!(partners.poll_event(at(4000)).is_some());
+            (partners, at)
+        };
+        let (mut partners, at) = silent();
+        partners.handle_message(at(4001), "arm");
         assert_eq!(partners.unreachable().count(), 0);
+        for moved in [local(2), remote(2, "argo-mts")] {
+            let (mut partners, at) = silent();
+            partners.handle_change(at(4001), &Change::Joined(moved));
+            assert_eq!(partners.unreachable().count(), 0);
+            let event = partners.poll_event(at(4001));
+            assert!(matches!(event, Some(PartnerEvent::Returned { .. })));
+        }
     }
 
     #[test]

@@ -661,7 +661,8 @@ impl Reading {
                 tokio::select! {
                     () = tokio::time::sleep_until(latest) => break,
                     change = changes.next() => match change {
-                        Some(Change::Joined(entry)) if self.is_publisher(&entry.name) => {
+                        Some(change) if self.may_have_returned(&change) => {
+                            pause = AGAIN_FIRST;
                             tokio::time::sleep_until(earliest).await;
                             break;
                         }
@@ -691,8 +692,14 @@ impl Reading {
         }
     }
 
-    fn is_publisher(&self, name: &str) -> bool {
-        self.receivers.iter().any(|it| it.name() == name)
+    /// Whether the publisher is registered again after this change, or its registration says something else.
+    fn may_have_returned(&self, change: &Change) -> bool {
+        change.single().iter().any(|change| match change {
+            Change::Joined(entry) | Change::Changed { after: entry, .. } => {
+                self.receivers.iter().any(|it| it.name() == &*entry.name)
+            }
+            _ => false,
+        })
     }
 }
 

@@ -140,6 +140,11 @@ impl PartnerWatch {
         self.partners.all_gone()
     }
 
+    /// Whether an agent of another host may have left the directory for a while only.
+    pub(super) fn may_return(&self) -> bool {
+        self.partners.may_return()
+    }
+
     /// Returns the agents that are unreachable now, with the time of their last sign of life.
     pub(super) fn unreachable(&self) -> impl Iterator<Item = (&str, Instant)> {
         self.partners.unreachable()

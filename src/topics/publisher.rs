@@ -729,7 +729,7 @@ async fn notify(
                     // The publisher may not wait for it.
                     let _ = result.send(NotificationResult::Outcome(delivery.outcome));
                 }
-                if is_gone {
+                if is_gone && !dialogue.may_return() {
                     let agent = delivery.receiver.to_string();
                     return Err(DialogueError::Gone { agent });
                 }

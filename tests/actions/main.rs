@@ -553,7 +553,7 @@ async fn a_client_waits_for_a_late_decision() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_decision_that_crosses_the_question_for_it_counts() {
     let mut host = host();
-    host.push("mts.deadline=2s".to_owned());
+    host.push("mts.deadline=6s".to_owned());
     let domain = Domain::open(&load(host.clone())).await.unwrap();
     let _robot = process::start("robot", &host);
     let rover = domain.register("rover").await.unwrap();
@@ -564,7 +564,7 @@ async fn a_decision_that_crosses_the_question_for_it_counts() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_answer_that_arrives_while_the_robot_is_asked_for_the_status_counts() {
-    let (here, there) = two(&config(&["mts.deadline=1s"])).await;
+    let (here, there) = two(&config(&["mts.deadline=5s"])).await;
     let (rover, robot) = (
         here.register("rover").await.unwrap(),
         there.register("crex").await.unwrap(),
@@ -579,7 +579,8 @@ async fn an_answer_that_arrives_while_the_robot_is_asked_for_the_status_counts()
         assert!(sent.all_succeeded(), "{sent}");
         // The question is not answered.
     };
-    let (goal, ()) = tokio::join!(crex.invoke("jump", &()), answering);
+    let both = async { tokio::join!(crex.invoke("jump", &()), answering) };
+    let (goal, ()) = tokio::time::timeout(TIMEOUT, both).await.unwrap();
     assert!(goal.is_ok(), "{goal:?}");
 }
 

@@ -72,7 +72,7 @@ pub(crate) fn run() {
 }
 
 /// Time for which the action `think` blocks the robot, more than twice the deadline of letters.
-pub(crate) const THOUGHT: Duration = Duration::from_secs(5);
+pub(crate) const THOUGHT: Duration = Duration::from_secs(14);
 
 /// An action that runs until it is to stop.
 pub(crate) fn endless(name: &str) -> Action {

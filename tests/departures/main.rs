@@ -13,10 +13,10 @@ mod support;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa::actions::GoalState;
+use fipa::actions::{GoalHandle, GoalState, ProgressUpdates, Robot};
 use fipa::blocking::Wait;
-use fipa::protocol::{DialogueError, PartnerEvent};
-use fipa::{Agent, AgentId, Domain, Gateway, Message, MessageBuilder, Performative};
+use fipa::protocol::{DialogueError, PartnerEvent, Reachability};
+use fipa::{Agent, AgentId, Domain, Gateway, Kind, Message, MessageBuilder, Performative};
 use process::Process;
 use rustix::process::Signal;
 
@@ -283,6 +283,25 @@ impl TwoHosts {
         }
     }
 
+    /// Starts hosts of which the other one opens the connection, so that its gateway may start again.
+    async fn start_dialed(set: &[&str]) -> Self {
+        let here = support::load(host(set));
+        let near = Gateway::open(&here).await.unwrap();
+        let mut locations = near.locations().into_iter();
+        let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+        let knows = format!(
+            "discovery.static={{near=[\"tcp://{}\"]}}",
+            location.address()
+        );
+        let there = host(&[set, &[&knows]].concat());
+        Self {
+            _near: near,
+            domain: Domain::open(&here).await.unwrap(),
+            far: Process::start("gateway", &there),
+            there,
+        }
+    }
+
     /// Starts an agent on the other host, and waits until this host knows it.
     async fn agent(&self, name: &str) -> Process {
         let process = Process::start(name, &self.there);
@@ -341,7 +360,7 @@ async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
     hosts.far.signal(Signal::STOP);
     let result = tokio::spawn(async move { request.result().await });
     let impatient = tokio::spawn(async move { short.result().await });
-    assert!(patient(reachability.changed()).await);
+    until_reachable(&mut reachability, false).await;
     let silent = reachability.unreachable();
     assert_eq!(silent[0].agent, "arm");
     assert!(silent[0].since <= Instant::now());
@@ -356,11 +375,17 @@ async fn a_silent_host_is_reported_and_the_call_goes_on_when_it_returns() {
     assert!(!result.is_finished());
 
     hosts.far.signal(Signal::CONT);
-    assert!(patient(reachability.changed()).await);
-    assert!(reachability.unreachable().is_empty());
+    until_reachable(&mut reachability, true).await;
     arm.finish();
     assert_eq!(text(&result.await.unwrap().unwrap()), "done");
     assert_eq!(text(&patient(charge.next()).await.unwrap()), "second");
+}
+
+/// Waits until all partners are reachable, or one is not. A busy machine is silent for a moment, too.
+async fn until_reachable(reachability: &mut Reachability, wanted: bool) {
+    while reachability.unreachable().is_empty() != wanted {
+        assert!(patient(reachability.changed()).await);
+    }
 }
 
 /// A robot takes four requests for one goal.
@@ -384,11 +409,9 @@ async fn a_goal_goes_on_although_its_host_is_silent_again_and_again() {
     let watched = async {
         for _ in 0..5 {
             hosts.far.signal(Signal::STOP);
-            assert!(patient(reachability.changed()).await);
-            assert!(!reachability.unreachable().is_empty());
+            until_reachable(&mut reachability, false).await;
             hosts.far.signal(Signal::CONT);
-            assert!(patient(reachability.changed()).await);
-            assert!(reachability.unreachable().is_empty());
+            until_reachable(&mut reachability, true).await;
             let status = robot.status_of(id.as_str()).await.unwrap();
             assert_eq!(status.state, GoalState::Executing);
         }
@@ -401,6 +424,33 @@ async fn a_goal_goes_on_although_its_host_is_silent_again_and_again() {
     assert!(unread.is_none(), "{unread:?}");
 }
 
+/// Sends the goal of an action that goes on, to a host to which the first connection may need longer than a letter has.
+async fn held<'a>(robot: &Robot<'a>) -> GoalHandle<'a> {
+    let goal = robot.goal("hold", &()).unwrap();
+    let sent = async {
+        loop {
+            if let Ok(handle) = robot.send(goal.clone()).await {
+                break handle;
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    patient(sent).await
+}
+
+/// Subscribes to the progress of such a goal.
+async fn progress_of(goal: &GoalHandle<'_>) -> ProgressUpdates {
+    let subscribed = async {
+        loop {
+            if let Ok(progress) = goal.progress().await {
+                break progress;
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    patient(subscribed).await
+}
+
 /// Letters of the robot fail at their deadline, which is shorter than the silence.
 #[tokio::test(flavor = "multi_thread")]
 async fn progress_goes_on_after_letters_were_not_delivered() {
@@ -408,19 +458,8 @@ async fn progress_goes_on_after_letters_were_not_delivered() {
     let mut process = hosts.agent("robot").await;
     let rover = hosts.domain.register("rover").await.unwrap();
     let robot = rover.robot(AgentId::new("robot").unwrap());
-    let mut goal = robot.goal("hold", &()).unwrap();
-    goal.id = Some("first".to_owned());
-    let goal = patient(async {
-        loop {
-            // The first connection may need longer than a letter has.
-            match robot.send(goal.clone()).await {
-                Ok(goal) => break goal,
-                Err(error) => println!("{error}"),
-            }
-        }
-    });
-    let goal = goal.await;
-    let mut progress = goal.progress().await.unwrap();
+    let goal = held(&robot).await;
+    let mut progress = progress_of(&goal).await;
     let mut step = async || {
         let status = patient(progress.next()).await.unwrap().unwrap();
         let note = status.progress.and_then(|it| it.note).unwrap();
@@ -437,4 +476,57 @@ async fn progress_goes_on_after_letters_were_not_delivered() {
     }
     process.finish();
     assert_eq!(goal.result::<String>().await.unwrap(), "done");
+}
+
+/// Without a gateway, the host of the robot knows no agent of another host.
+#[tokio::test(flavor = "multi_thread")]
+async fn notifications_go_on_after_the_gateway_of_the_robot_was_away() {
+    let mut hosts = TwoHosts::start_dialed(&[]).await;
+    let _process = hosts.agent("robot").await;
+    let rover = hosts.domain.register("rover").await.unwrap();
+    let robot = rover.robot(AgentId::new("robot").unwrap());
+    let goal = robot.invoke("hold", &()).await.unwrap();
+    let mut progress = goal.progress().await.unwrap();
+    let mut step = async || {
+        let status = patient(progress.next()).await.unwrap().unwrap();
+        let note = status.progress.and_then(|it| it.note).unwrap();
+        note.parse::<u64>().unwrap()
+    };
+    let subscribe = to(&rover, Performative::Subscribe, "robot").content("count");
+    let mut counts = rover.subscribe(subscribe, TIMEOUT).await.unwrap();
+    let mut count = async || loop {
+        match patient(counts.next()).await {
+            Err(DialogueError::Unreachable { .. }) => {}
+            number => {
+                let number = number.unwrap();
+                assert!(!number.is_restart(), "the subscription has ended");
+                break text(&number).parse::<u64>().unwrap();
+            }
+        }
+    };
+    let before = (step().await, count().await);
+    hosts.far.kill();
+    // The robot sends notifications meanwhile.
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    hosts.far = Process::start("gateway", &hosts.there);
+    while step().await < before.0 + 60 {}
+    while count().await < before.1 + 60 {}
+}
+
+/// The letter with the result fails at its deadline, and no silence is long enough to be an event.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_result_that_was_not_delivered_is_asked_for() {
+    let hosts = TwoHosts::start(&["monitor.heartbeat=60s", "mts.deadline=1s"]).await;
+    let mut process = hosts.agent("robot").await;
+    let rover = hosts.domain.register("rover").await.unwrap();
+    let robot = rover.robot(AgentId::new("robot").unwrap());
+    let mut goal = held(&robot).await;
+    hosts.far.signal(Signal::STOP);
+    process.finish();
+    tokio::time::sleep(Duration::from_secs(4)).await;
+    hosts.far.signal(Signal::CONT);
+    let delivered = tokio::time::timeout(Duration::from_secs(2), goal.outcome()).await;
+    assert!(delivered.is_err(), "{delivered:?}");
+    let result = tokio::time::timeout(TIMEOUT * 3, goal.result::<String>()).await;
+    assert_eq!(result.unwrap().unwrap(), "done");
 }

@@ -70,7 +70,7 @@ pub(crate) fn run() {
     });
 }
 
-/// Offers an action that ends when the test says so.
+/// Offers an action that ends when the test says so, and publishes numbers.
 async fn robot(config: &Config, finish: &Arc<Semaphore>) {
     let domain = Domain::open(config).await.unwrap();
     let robot = domain.register("robot").await.unwrap();
@@ -95,8 +95,12 @@ async fn robot(config: &Config, finish: &Arc<Semaphore>) {
         }
     };
     let _offer = robot.offer(Action::new("hold"), hold).unwrap();
+    let count = robot.publisher("count").unwrap();
     say("ready");
-    std::future::pending::<()>().await;
+    for number in 0_u64.. {
+        count.publish(number.to_string()).await;
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
 }
 
 async fn agent(config: &Config, name: &str, finish: &Arc<Semaphore>) {

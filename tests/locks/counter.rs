@@ -108,10 +108,10 @@ pub(super) struct Kept {
     pub(super) grants: u64,
 }
 
-/// Reads and writes the counter, with the fence of the live grant only.
+/// Reads and writes the counter, with the fence of the live grant only, until `ends`, and until a worker has written.
 pub(super) async fn keep(keeper: &Agent, counter: &Owned, ends: &AtomicBool) -> Kept {
     let mut kept = Kept::default();
-    while !ends.load(Ordering::Relaxed) {
+    while !ends.load(Ordering::Relaxed) || kept.admitted == 0 {
         let received = tokio::time::timeout(Duration::from_millis(50), keeper.receive()).await;
         let Ok(received) = received else {
             continue;
@@ -244,11 +244,12 @@ async fn a_guarded_counter_loses_no_increment_when_holders_are_killed_and_stoppe
             until("the counter is locked again", || {
                 position().is_some() && position() != at_end
             });
-            (kills, stops)
+            (kills, stops, workers)
         });
-        let (kills, stops) = chaos.await.unwrap();
+        let (kills, stops, workers) = chaos.await.unwrap();
         ends.store(true, Ordering::Relaxed);
         let kept = keeping.await.unwrap();
+        drop(workers);
         println!(
             "{kills} kills, {stops} stops, {} grants, {} increments, {} refused commands",
             kept.grants, kept.admitted, kept.refused

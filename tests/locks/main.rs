@@ -265,7 +265,7 @@ async fn waiting_agents_fail_and_leases_end_when_the_owner_has_ended() {
         let files = tempfile::tempdir().unwrap();
         let crane = agent(&here, "crane").await;
         let (rover, arm) = (agent(&there, "rover").await, agent(&there, "arm").await);
-        let short = Duration::from_millis(800);
+        let short = Duration::from_secs(3);
         let bay = crane.own("bay", kept(&files, short)).await.unwrap();
         let dock = crane.own("dock", kept(&files, FOREVER)).await.unwrap();
         let _held = rover.lock("dock").await.unwrap();
@@ -409,7 +409,7 @@ async fn the_fences_of_an_owner_rise_over_its_restarts() {
         let domain = Domain::open(&config(&[])).await.unwrap();
         let files = tempfile::tempdir().unwrap();
         let rover = agent(&domain, "rover").await;
-        let lease = Duration::from_millis(300);
+        let lease = Duration::from_secs(2);
         let mut last: Option<Fence> = None;
         for life in 0..4 {
             let crane = agent(&domain, "crane").await;
@@ -556,7 +556,7 @@ async fn an_owner_needs_its_state_file_and_its_resource() {
         let volatile = OwnOptions {
             volatile: true,
             forget: true,
-            lease: Duration::from_millis(200),
+            lease: Duration::from_secs(2),
             ..no_directory
         };
         let bay = crane.own("bay", volatile).await.unwrap();

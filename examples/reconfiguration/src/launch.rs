@@ -24,8 +24,8 @@ use crate::{Fault, PROTOCOL};
 
 /// Maximum time for a process to start or end.
 const STEP: Duration = Duration::from_secs(20);
-/// Maximum time of a run.
-const RUN: Duration = Duration::from_secs(90);
+/// Maximum time of a run: the attempts of the operator, each with its wait for answers, on a busy machine.
+const RUN: Duration = Duration::from_secs(240);
 /// Duration of the cut of the link.
 const CUT: Duration = Duration::from_secs(10);
 /// Duration of the stop of the master, longer than the lease.
