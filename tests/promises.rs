@@ -461,7 +461,7 @@ async fn a_letter_is_not_sent_unencrypted_and_its_outcome_has_the_failed_attempt
             sender: ROVER,
             letter: letter(1),
             receivers: vec!["arm".into()],
-            deadline: Duration::from_secs(5),
+            deadline: Duration::from_secs(30),
         });
         let outcome = outcome(sending).await;
         assert_eq!(outcome.via(), by, "{outcome}");

@@ -236,7 +236,7 @@ async fn a_broker_or_recruiter_may_refuse_or_find_no_agent() {
             .recruiting(proxy(&rover, &broker), TIMEOUT)
             .await;
         assert!(matches!(none.err(), Some(DialogueError::Failed(_))));
-        let moment = Duration::from_secs(1);
+        let moment = Duration::from_secs(5);
         let silent = rover
             .protocols()
             .brokering(proxy(&rover, &broker), moment)

@@ -106,7 +106,7 @@ async fn a_confirmed_cancel_ends_a_request_although_its_wait_was_given_up() {
     let mut request = rover.request(lift, TIMEOUT).await.unwrap();
     let first = next_message(&arm).await.unwrap().into_message();
     answer(&arm, &first, Performative::Agree, "").await;
-    let timed_out = request.cancel(Duration::from_secs(2)).await;
+    let timed_out = request.cancel(Duration::from_secs(5)).await;
     assert!(
         matches!(timed_out, Err(DialogueError::TimedOut)),
         "{timed_out:?}"

@@ -233,7 +233,7 @@ async fn a_contract_net_is_cancelled_with_all_open_participants() {
     };
     let initiator = async {
         // Long enough for the two that answer; the third never does.
-        let timeout = Duration::from_secs(3);
+        let timeout = Duration::from_secs(6);
         let net = rover
             .contract_net(cfp(&rover, "carry"), &ids(&arms), timeout)
             .await
@@ -294,7 +294,7 @@ async fn the_last_bidder_wins_an_english_auction() {
         assert_eq!(auction.leader().unwrap().name(), "poor");
         let twice = auction.accept(from(&bids.proposals, "poor"), "").await;
         assert!(matches!(twice, Err(DialogueError::WouldViolate(_))));
-        let moment = Duration::from_secs(2);
+        let moment = Duration::from_secs(5);
         let bids = auction.call("20", moment).await.unwrap();
         assert_eq!(bids.silent, ["poor"], "it leads");
         auction.accept(&bids.proposals[0], "").await.unwrap();
@@ -328,7 +328,7 @@ async fn a_dutch_auction_continues_while_goods_are_left() {
         let mut sold = Vec::new();
         let mut price = 40;
         while sold.len() < 2 {
-            let moment = Duration::from_secs(2);
+            let moment = Duration::from_secs(5);
             let bids = auction.call(price.to_string(), moment).await.unwrap();
             if let Some(first) = bids.proposals.first() {
                 auction.accept(first, "").await.unwrap();

@@ -427,7 +427,7 @@ fn half_letters_stay_within_the_memory_budget_and_block_no_peer() {
     small.limits.max_incoming = 4 * EACH;
     // Loopback has twice the limit.
     small.limits.max_incoming_per_source = EACH + EACH / 4;
-    small.limits.stall_timeout = Duration::from_millis(150);
+    small.limits.stall_timeout = Duration::from_millis(500);
     // All of them together would have 32 MiB.
     let party = Party::lending(small);
     let start = Arc::new(Barrier::new(33));

@@ -353,7 +353,7 @@ fn withdrawn_trust_ends_the_connection<T: Proving>() {
 fn an_expired_certificate_ends_the_connection<T: Proving>() {
     let now = SystemTime::now();
     // Time for a handshake under load.
-    let ends = now + Duration::from_secs(4);
+    let ends = now + Duration::from_secs(8);
     let day = Duration::from_secs(86_400);
     let (rover, crex) = (
         Host::valid(NAME, &[], now - day, ends),

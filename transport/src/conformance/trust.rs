@@ -35,7 +35,7 @@ impl fmt::Debug for KeyedEndpoint {
 }
 
 /// Validity of a certificate that ends during a test, with time for handshakes under load.
-const SHORT: Duration = Duration::from_secs(4);
+const SHORT: Duration = Duration::from_secs(8);
 const DAY: Duration = Duration::from_secs(86_400);
 
 #[derive(Default)]
