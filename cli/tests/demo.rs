@@ -67,12 +67,8 @@ fn every_step_passes() {
         assert_eq!(step["ok"], true, "{step:#}");
     }
     assert!(output.status.success());
-    // On a busy machine, a process may read the letters of the measurement later than they arrive, and accept the
-    // connection of a process that it watches later than that waits.
-    let is_late = |line: &&str| {
-        line.contains("the program keeps the content of letters")
-            || line.contains("a watcher did not accept the connection")
-    };
+    // On a busy machine, a process may read the letters of the measurement later than they arrive.
+    let is_late = |line: &&str| line.contains("the program keeps the content of letters");
     let errors = String::from_utf8_lossy(&output.stderr);
     let others: Vec<_> = errors.lines().filter(|line| !is_late(line)).collect();
     assert_eq!(others, Vec::<&str>::new());

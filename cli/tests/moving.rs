@@ -24,8 +24,8 @@ use tempfile::TempDir;
 use tokio::runtime::Runtime;
 
 /// Deadline of a letter that is sent as soon as a new address is usable. It is the maximum time for
-/// which a gateway may be unreachable on a busy machine, less than any cache of addresses lasts.
-const BOUND: Duration = Duration::from_secs(10);
+/// which a gateway may be unreachable.
+const BOUND: Duration = Duration::from_secs(3);
 /// Timeout that ends a hung test.
 const WATCHDOG: Duration = Duration::from_secs(60);
 const PORT: u16 = 7788;

@@ -132,7 +132,6 @@ on_a_network!(
         let fleet = Fleet::new(&Plan {
             // No other transport can replace QUIC.
             transports: &["shm", "quic"],
-            deadline: Duration::from_secs(20),
             dials: Some(1),
             ..Plan::default()
         });
