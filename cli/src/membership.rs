@@ -13,9 +13,7 @@ use fipa::admin::watch::{WatchOptions, Watcher};
 use fipa::config::{ConfigError, Reloaded};
 use fipa::error::{DomainDirError, ErrorChain, ListenError, OpenError, RegisterError, WebError};
 use fipa::threads::ThreadError;
-use fipa::{
-    Agent, AgentId, Config, Domain, Entry, Incarnation, Reach, RegisterOptions, Role, log_limit,
-};
+use fipa::{Agent, AgentId, Config, Domain, Entry, Incarnation, RegisterOptions, log_limit};
 use fipa_acl::{escape, escape_name};
 use rustix::process::Signal;
 use tokio::signal::unix::{self, SignalKind};
@@ -507,8 +505,7 @@ pub(crate) async fn introduce(
 /// Returns the gateway of this host, if one is running.
 pub(crate) fn gateway(domain: &Domain) -> Option<Arc<Entry>> {
     let entries = domain.directory().entries();
-    let is_own = |entry: &&Arc<Entry>| entry.role == Role::Gateway && entry.reach == Reach::Local;
-    entries.iter().find(is_own).cloned()
+    entries.iter().find(|entry| entry.is_own_gateway()).cloned()
 }
 
 /// Maximum time for the gateway's report.

@@ -132,6 +132,12 @@ impl Entry {
         !self.locations.is_empty() && !self.locations.iter().any(supported)
     }
 
+    /// Whether it is the entry of the gateway of this host.
+    #[must_use]
+    pub fn is_own_gateway(&self) -> bool {
+        self.role == Role::Gateway && self.reach == Reach::Local
+    }
+
     /// Whether the agent is known by a letter or an introduction only, and has no registration: an agent of a
     /// platform such as JADE.
     #[must_use]

@@ -6,7 +6,7 @@
 
 use fipa_acl::Performative;
 use fipa_mts::DeliveryFailure;
-use fipa_sds::{Directory, Reach, Role};
+use fipa_sds::Directory;
 
 use crate::agent::incoming::Incoming;
 
@@ -28,7 +28,7 @@ pub(crate) fn read(incoming: &Incoming, directory: &dyn Directory) -> Option<Box
         None if service.is_known() => {
             // The gateway of this host hands over the letters of legacy peers in its own name.
             let sender = directory.by_incarnation(service);
-            sender.is_some_and(|it| it.role == Role::Gateway && it.reach == Reach::Local)
+            sender.is_some_and(|it| it.is_own_gateway())
         }
         None => true,
     };
@@ -43,7 +43,7 @@ mod tests {
     use fipa_acl::{AgentId, Message};
     use fipa_mts::core::Received;
     use fipa_mts::letter_for;
-    use fipa_sds::{MemoryDirectory, MtsId, Registration};
+    use fipa_sds::{MemoryDirectory, MtsId, Registration, Role};
     use fipa_transport::{Incarnation, Kind};
 
     use super::*;

@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use fipa_acl::Message;
-use fipa_sds::{Entry, Reach, Role};
+use fipa_sds::Entry;
 use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
@@ -751,8 +751,7 @@ impl Admitted {
         let is_own = incoming.via.is_none();
         let agent = incoming.sender;
         // The gateway of this host hands over the letters of legacy peers in its own name.
-        let is_of_gateway =
-            registered.is_some_and(|it| it.role == Role::Gateway && it.reach == Reach::Local);
+        let is_of_gateway = registered.is_some_and(|it| it.is_own_gateway());
         if let Some(party) = parties.iter().find(|party| *party.name == *sender) {
             return match registered {
                 _ if is_own => true,
@@ -773,7 +772,7 @@ mod tests {
     use fipa_acl::{AgentId, Performative};
     use fipa_mts::core::Received;
     use fipa_mts::letter_for;
-    use fipa_sds::{Directory, MemoryDirectory, MtsId, Registration};
+    use fipa_sds::{Directory, MemoryDirectory, MtsId, Reach, Registration, Role};
     use fipa_transport::Kind;
 
     use super::*;

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, ErrorChain, Letter};
 use fipa_mts::{Mts, Sending};
-use fipa_sds::{Directory, Entry, Reach, Role};
+use fipa_sds::{Directory, Entry};
 use fipa_transport::{Attempt, Incarnation, Location, TransportError, TransportErrorKind};
 use parking_lot::Mutex;
 use tokio::sync::oneshot;
@@ -152,8 +152,7 @@ impl Introductions {
 /// Returns the entry of the gateway of this host.
 fn gateway_of(domain: &Domain) -> Result<Arc<Entry>, Arc<str>> {
     let entries = domain.inner.service.host.entries();
-    let is_own = |entry: &&Arc<Entry>| entry.role == Role::Gateway && entry.reach == Reach::Local;
-    let gateway = entries.iter().find(is_own).cloned();
+    let gateway = entries.iter().find(|entry| entry.is_own_gateway()).cloned();
     gateway.ok_or_else(|| {
         "no gateway is running on this host, and only gateways reach other platforms; start one with `fipa up`".into()
     })

@@ -14,7 +14,7 @@ use fipa_locking::{
     LockMessage, LockPeer, Locks, Millis, Resource, codec,
 };
 use fipa_mts::letter_for;
-use fipa_sds::{Change, Entry, Reach, Role, Watch};
+use fipa_sds::{Change, Entry, Role, Watch};
 use fipa_transport::{Incarnation, log_limit};
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -757,11 +757,10 @@ impl Task {
                     let is_free = directory.known_incarnation(proved).is_none();
                     return (is_free && self.watched.contains(&peer)).then_some(peer);
                 };
-                let by_gateway = entry.role == Role::Gateway && entry.reach == Reach::Local;
                 match *entry.name == *name {
                     true => proved,
                     // The gateway of this host hands over the letters of legacy peers as its own.
-                    false if by_gateway => legacy(directory, name)?,
+                    false if entry.is_own_gateway() => legacy(directory, name)?,
                     false => return None,
                 }
             }

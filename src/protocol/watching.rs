@@ -7,7 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, ErrorChain, Message, Performative, escape_name};
 use fipa_mts::core::Submission;
 use fipa_mts::letter_for;
-use fipa_sds::{Change, Directory, Entry, Reach, Role, Watch};
+use fipa_sds::{Change, Directory, Entry, Watch};
 use fipa_transport::{Incarnation, log_limit};
 
 use super::partners::{PartnerEvent, Partners};
@@ -170,9 +170,7 @@ impl PartnerWatch {
     /// stays without an answer.
     fn ask(&mut self, asked: &[Asked]) {
         let entries = self.directory().entries();
-        let is_gateway =
-            |entry: &&Arc<Entry>| entry.role == Role::Gateway && entry.reach == Reach::Local;
-        let Some(gateway) = entries.iter().find(is_gateway) else {
+        let Some(gateway) = entries.iter().find(|entry| entry.is_own_gateway()) else {
             return;
         };
         self.admit(gateway);

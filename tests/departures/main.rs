@@ -13,7 +13,7 @@ mod support;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa::actions::{GoalHandle, GoalState, ProgressUpdates, Robot};
+use fipa::actions::{ActionError, GoalHandle, GoalState, Robot};
 use fipa::blocking::Wait;
 use fipa::protocol::{DialogueError, PartnerEvent, Reachability};
 use fipa::{Agent, AgentId, Domain, Gateway, Kind, Message, MessageBuilder, Performative};
@@ -424,31 +424,23 @@ async fn a_goal_goes_on_although_its_host_is_silent_again_and_again() {
     assert!(unread.is_none(), "{unread:?}");
 }
 
-/// Sends the goal of an action that goes on, to a host to which the first connection may need longer than a letter has.
-async fn held<'a>(robot: &Robot<'a>) -> GoalHandle<'a> {
-    let goal = robot.goal("hold", &()).unwrap();
-    let sent = async {
+/// Repeats a call until it succeeds: the first connection may need longer than a letter has.
+async fn repeated<T>(mut call: impl AsyncFnMut() -> Result<T, ActionError>) -> T {
+    let succeeded = async {
         loop {
-            if let Ok(handle) = robot.send(goal.clone()).await {
-                break handle;
+            if let Ok(result) = call().await {
+                break result;
             }
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
     };
-    patient(sent).await
+    patient(succeeded).await
 }
 
-/// Subscribes to the progress of such a goal.
-async fn progress_of(goal: &GoalHandle<'_>) -> ProgressUpdates {
-    let subscribed = async {
-        loop {
-            if let Ok(progress) = goal.progress().await {
-                break progress;
-            }
-            tokio::time::sleep(Duration::from_millis(50)).await;
-        }
-    };
-    patient(subscribed).await
+/// Sends the goal of an action that goes on.
+async fn held<'a>(robot: &Robot<'a>) -> GoalHandle<'a> {
+    let goal = robot.goal("hold", &()).unwrap();
+    repeated(async || robot.send(goal.clone()).await).await
 }
 
 /// Letters of the robot fail at their deadline, which is shorter than the silence.
@@ -459,7 +451,7 @@ async fn progress_goes_on_after_letters_were_not_delivered() {
     let rover = hosts.domain.register("rover").await.unwrap();
     let robot = rover.robot(AgentId::new("robot").unwrap());
     let goal = held(&robot).await;
-    let mut progress = progress_of(&goal).await;
+    let mut progress = repeated(async || goal.progress().await).await;
     let mut step = async || {
         let status = patient(progress.next()).await.unwrap().unwrap();
         let note = status.progress.and_then(|it| it.note).unwrap();

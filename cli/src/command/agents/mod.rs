@@ -538,10 +538,7 @@ fn location_text(location: &Location) -> String {
 
 fn gateway(directory: DirectoryView<'_>) -> Option<Arc<Entry>> {
     let entries = directory.entries();
-    let mut gateways = entries
-        .iter()
-        .filter(|entry| entry.role == Role::Gateway && entry.reach == Reach::Local);
-    gateways.next().cloned()
+    entries.iter().find(|entry| entry.is_own_gateway()).cloned()
 }
 
 fn source(source: Source) -> &'static str {

@@ -417,9 +417,7 @@ impl Observer {
         let local = agents.clone().filter(|it| it.reach == Reach::Local);
         self.meter.register(now, local.clone().map(|it| &*it.name));
         let here = local.count();
-        let gateway = entries
-            .iter()
-            .find(|entry| entry.role == Role::Gateway && entry.reach == Reach::Local);
+        let gateway = entries.iter().find(|entry| entry.is_own_gateway());
         let surroundings = Surroundings {
             domain: self.domain.clone(),
             host: self.host.clone(),

@@ -380,8 +380,7 @@ fn recorders(agent: &Agent) -> BTreeMap<String, Recorder> {
     let directory = agent.domain().directory();
     directory.refresh();
     let entries = directory.entries();
-    let mut gateways = entries.iter().filter(|it| it.role == Role::Gateway);
-    let own = gateways.find(|it| it.reach == Reach::Local);
+    let own = entries.iter().find(|it| it.is_own_gateway());
     let own = own.map(|it| it.name.to_string());
     let found = entries.iter().filter_map(|entry| {
         let is_recorder = entry.role == Role::Agent && entry.agent_type == Entry::RECORDER_TYPE;
